@@ -1,0 +1,21 @@
+//! Row-major `f32` images and masks, bilinear sampling with its pullback, and colour transfer.
+//!
+//! Invariant: nothing here knows of files, cameras or lights, and nothing outside the standard library is used.
+//!
+//! Pixel centres lie at `+0.5`: the pixel in column `x`, row `y` covers `[x, x+1) × [y, y+1)`; row 0 is at the top.
+//! Values are interleaved: element `(x, y, c)` lies at `(y·width + x)·channels + c`.
+//!
+//! ```
+//! use diamond_image::Image;
+//! let mut image = Image::new(4, 2, 3);
+//! image.pixel_mut(1, 0)[2] = 0.5;
+//! assert_eq!(image.pixel(1, 0), &[0.0, 0.0, 0.5]);
+//! ```
+mod bilinear;
+mod image;
+mod mask;
+mod transfer;
+
+pub use image::{Image, ImageError};
+pub use mask::Mask;
+pub use transfer::Transfer;

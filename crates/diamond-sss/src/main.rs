@@ -1,0 +1,2 @@
+//! The `diamond` program.
+fn main() {}

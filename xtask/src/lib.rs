@@ -1,0 +1,1 @@
+//! Fixtures, tidy, oracle checks, tests, benchmarks.

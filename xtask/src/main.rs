@@ -1,0 +1,2 @@
+//! Fixtures, tidy, oracle checks, tests, benchmarks.
+fn main() {}
