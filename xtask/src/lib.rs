@@ -1,1 +1,5 @@
-//! Fixtures, tidy, oracle checks, tests, benchmarks.
+//! The workspace's own tools, as a library: what `cargo xtask` does, callable from tests.
+//!
+//! `cargo xtask oracle` and the cross-crate tests run the same code, so a table that passes in one passes in the other.
+
+pub mod oracle;

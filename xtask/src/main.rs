@@ -1,2 +1,3 @@
-//! Fixtures, tidy, oracle checks, tests, benchmarks.
+//! `cargo xtask`: the workspace's own tools.
+
 fn main() {}
