@@ -1,1 +1,10 @@
-//! See Cargo.toml.
+//! Anisotropic Gaussians and the N-channel tile rasteriser that blends them, forward and backward, on the CPU.
+//!
+//! Invariant: this crate knows nothing of materials, lights or images from disk: it blends feature channels.
+mod config;
+mod error;
+mod gaussians;
+
+pub use config::{Cutoff, RasterConfig};
+pub use error::SplatError;
+pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
