@@ -1,1 +1,4 @@
 //! See Cargo.toml.
+mod error;
+
+pub use error::ShadingError;
