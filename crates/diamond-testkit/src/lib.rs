@@ -3,5 +3,6 @@
 //! Invariant: depends on no crate of ours, so an oracle can never share a mistake with what it judges.
 pub mod adjoint;
 mod real;
+pub mod strategies;
 
-pub use real::{Dual, Real, gradient};
+pub use real::{Dual, Real, gradient, jvp, vjp};
