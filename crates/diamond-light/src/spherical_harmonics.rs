@@ -43,6 +43,10 @@ const C3_1: f32 = 0.457_045_8;
 /// ¼·√(7/π): z(5z² − 3).
 const C3_0: f32 = 0.373_176_33;
 
+/// Components are cut to this before use: unit directions never come near it, and its cube still fits an `f32`, so that
+/// any finite input gives finite output.
+const MAX_COMPONENT: f32 = 1e6;
+
 /// Number of coefficients up to `degree`: (degree + 1)². Degrees above [`MAX_DEGREE`] count as it.
 pub const fn coefficients_to_degree(degree: usize) -> usize {
     let n = if degree < MAX_DEGREE { degree + 1 } else { MAX_DEGREE + 1 };
@@ -52,7 +56,7 @@ pub const fn coefficients_to_degree(degree: usize) -> usize {
 /// The 16 basis functions in the unit direction `direction` (dimensionless, order `l² + l + m`).
 /// `[eq:sh-basis]`
 pub fn basis(direction: Vec3) -> [f32; COEFFICIENTS] {
-    let Vec3 { x, y, z } = direction;
+    let Vec3 { x, y, z } = direction.clamp(Vec3::splat(-MAX_COMPONENT), Vec3::splat(MAX_COMPONENT));
     let (xx, yy, zz) = (x * x, y * y, z * z);
     [
         C0,
@@ -78,7 +82,7 @@ pub fn basis(direction: Vec3) -> [f32; COEFFICIENTS] {
 /// tangent plane, or pull it through a normalisation, where the direction is a unit vector).
 /// `[eq:sh-basis]`
 pub fn basis_pull(direction: Vec3, d_basis: &[f32; COEFFICIENTS]) -> Vec3 {
-    let Vec3 { x, y, z } = direction;
+    let Vec3 { x, y, z } = direction.clamp(Vec3::splat(-MAX_COMPONENT), Vec3::splat(MAX_COMPONENT));
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let d = d_basis;
     let mut g = Vec3::new(-C1 * d[3], -C1 * d[1], C1 * d[2]);
@@ -99,4 +103,86 @@ pub fn basis_pull(direction: Vec3, d_basis: &[f32; COEFFICIENTS]) -> Vec3 {
 /// `[eq:sh-basis]`
 pub fn basis_to_degree(direction: Vec3, degree: usize) -> Vec<f32> {
     basis(direction)[..coefficients_to_degree(degree)].to_vec()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_testkit::adjoint::{adjoint_gap, relative_l2};
+    use diamond_testkit::light::sh_basis;
+    use diamond_testkit::strategies::{extreme, unit_vector, values, vector};
+    use diamond_testkit::{Dual, jvp, vjp};
+    use proptest::prelude::*;
+
+    fn wide(v: &[f32]) -> Vec<f64> {
+        v.iter().map(|&v| f64::from(v)).collect()
+    }
+
+    fn oracle(x: &[Dual]) -> Vec<Dual> {
+        sh_basis([x[0], x[1], x[2]], MAX_DEGREE)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(256))]
+
+        /// [eq:sh-basis]: value, gradient and adjoint identity against the recurrence, in and off the unit sphere.
+        #[test]
+        fn basis_and_pullback_agree_with_the_oracle(
+            d in prop_oneof![unit_vector(), vector(-1.5..1.5)], u in values(COEFFICIENTS, -1.0..1.0),
+            t in [-1.0f64..1.0, -1.0f64..1.0, -1.0f64..1.0],
+        ) {
+            let x = wide(&d);
+            let u: [f32; COEFFICIENTS] = u.try_into().unwrap();
+            let value = wide(&basis(d.into()));
+            let expected = sh_basis([x[0], x[1], x[2]], MAX_DEGREE);
+            prop_assert!(relative_l2(&value, &expected, 1e-3) <= 1e-6);
+            let got = wide(&basis_pull(d.into(), &u).to_array());
+            let expected = vjp(oracle, &x, &wide(&u));
+            let error = relative_l2(&got, &expected, 1e-1);
+            prop_assert!(error <= 1e-5, "{error:e}: {got:?} instead of {expected:?}");
+            prop_assert!(adjoint_gap(&wide(&u), &jvp(oracle, &x, &t), &got, &t) <= 1e-5);
+        }
+
+        /// One coefficient at a time, so that an error in a small one cannot hide behind the others.
+        #[test]
+        fn every_single_gradient_agrees(d in unit_vector(), i in 0..COEFFICIENTS) {
+            let mut u = [0.0f32; COEFFICIENTS];
+            u[i] = 1.0;
+            let got = wide(&basis_pull(d.into(), &u).to_array());
+            let error = relative_l2(&got, &vjp(oracle, &wide(&d), &wide(&u)), 1e-2);
+            prop_assert!(error <= 1e-5, "coefficient {i}: {error:e}");
+        }
+
+        #[test]
+        fn any_finite_direction_gives_finite_results(x in extreme(), y in extreme(), z in extreme()) {
+            let d = Vec3::new(x, y, z);
+            prop_assert!(basis(d).iter().all(|v| v.is_finite()));
+            prop_assert!(basis_pull(d, &[1.0; COEFFICIENTS]).is_finite());
+        }
+    }
+
+    /// The comparison above has been seen to fail: an exchanged pair of coefficients and a wrong sign are noticed.
+    #[test]
+    fn planted_errors_are_noticed() {
+        let d = Vec3::new(0.48, -0.6, 0.64);
+        let expected = sh_basis(wide(&d.to_array()).try_into().unwrap(), MAX_DEGREE);
+        let right = wide(&basis(d));
+        assert!(relative_l2(&right, &expected, 1e-3) <= 1e-6);
+        let mut exchanged = right.clone();
+        exchanged.swap(11, 13);
+        let mut negated = right;
+        negated[5] = -negated[5];
+        assert!([exchanged, negated].iter().all(|broken| relative_l2(broken, &expected, 1e-3) > 1e-2));
+    }
+
+    #[test]
+    fn degrees_nest() {
+        let d = Vec3::new(0.6, 0.0, -0.8);
+        for degree in 0..6 {
+            let y = basis_to_degree(d, degree);
+            assert_eq!(y.len(), coefficients_to_degree(degree));
+            assert_eq!(y, basis(d)[..y.len()]);
+        }
+        assert_eq!(coefficients_to_degree(MAX_DEGREE), COEFFICIENTS);
+    }
 }
