@@ -8,3 +8,12 @@ pub enum Depth {
     /// Euclidean distance from the camera centre.
     Distance(f32),
 }
+
+impl Depth {
+    /// The number, whatever its kind.
+    pub fn value(self) -> f32 {
+        match self {
+            Depth::Z(v) | Depth::Distance(v) => v,
+        }
+    }
+}

@@ -200,8 +200,10 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    type Binary<R> = fn(R, R) -> R;
+
     /// Every operation of the trait, as functions of two positive numbers.
-    fn operations<R: Real>() -> Vec<(&'static str, fn(R, R) -> R)> {
+    fn operations<R: Real>() -> Vec<(&'static str, Binary<R>)> {
         vec![
             ("add", |a, b| a + b),
             ("add_assign", |a, b| {
@@ -255,7 +257,7 @@ mod tests {
     /// The comparison above notices a derivative that is wrong by one part in a thousand, of the wrong sign, or lost.
     #[test]
     fn planted_errors_are_noticed() {
-        let broken: [(fn(Dual, Dual) -> Dual, &str); 3] = [
+        let broken: [(Binary<Dual>, &str); 3] = [
             (|a, b| Dual::new((a * b).v.exp(), (a * b).exp().d * 1.001), "scaled"),
             (|a, b| Dual::new((a * b).v.exp(), -(a * b).exp().d), "negated"),
             (|a, b| Dual::new((a * b).v.exp(), (a * Dual::of(b.v)).d * (a * b).v.exp()), "one input forgotten"),
