@@ -1,1 +1,31 @@
-//! See Cargo.toml.
+//! Captures: views × lights × images on disk, read lazily.
+//!
+//! A *capture* is a folder of photographs of one object, each taken with one camera under one light (OLAT). A *view* is
+//! a camera; a *shot* is one image of it with its light. A light's position belongs to the shot and not to an index: on
+//! a turntable the object moves under fixed lamps. Grids are incomplete, and nothing here assumes that views × lights
+//! all exist.
+//!
+//! Invariant: nothing here knows of Gaussians, shading or losses; whatever the bytes on disk, the answer is a value or
+//! a [`DatasetError`] that names file, frame and field, never a panic, and memory stays within the limits of
+//! [`OpenOptions`].
+mod cache;
+mod capture;
+mod error;
+mod field;
+mod folder;
+mod frames;
+mod geometry;
+mod hash;
+mod observation;
+mod scene;
+mod select;
+mod stored;
+mod write;
+
+pub use capture::{AlphaPremultiplied, Capture, EvalSplit, OpenOptions, Provenance, Shot, Split, TransferChoice, View};
+pub use error::{DatasetError, Place};
+pub use geometry::Geometry;
+pub use observation::{Observation, to_display};
+pub use scene::Scene;
+pub use select::{Selection, farthest_points};
+pub use write::{BitDepth, CaptureDescription, Pixels, ShotDescription, ViewDescription, write_capture};

@@ -1,0 +1,278 @@
+//! Choosing a few views and lights of a capture, evenly and reproducibly.
+use crate::scene::light_direction;
+use crate::{Capture, DatasetError, Shot, View};
+use diamond_light::OlatLight;
+use glam::Vec3;
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+/// Which views, or which lights, to keep.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Selection {
+    /// All of them.
+    #[default]
+    All,
+    /// So many, spread evenly over directions; all where there are fewer.
+    Count(usize),
+    /// These, by index from 0; ascending, no duplicates.
+    List(Vec<usize>),
+}
+
+/// Indices above this are refused: no capture has so many views or lights.
+const MAX_INDEX: usize = 1_000_000;
+
+/// As written on a command line: `all`; a count, `3`; indices, `0,5,7`, ranges included, `0-7` or `0-3,9`; one index
+/// alone with a comma, `2,`.
+impl FromStr for Selection {
+    type Err = DatasetError;
+
+    fn from_str(text: &str) -> Result<Self, DatasetError> {
+        let bad = |reason: String| DatasetError::Selection {
+            what: "selection",
+            reason: format!("\"{text}\": {reason}; write a count (3), indices (0,5,7 or 2,), ranges (0-7), or all"),
+        };
+        let number = |part: &str| -> Result<usize, DatasetError> {
+            let value = part.trim().parse::<usize>().map_err(|_| bad(format!("\"{part}\" is no whole number")))?;
+            if value > MAX_INDEX { Err(bad(format!("{value} is larger than {MAX_INDEX}"))) } else { Ok(value) }
+        };
+        let trimmed = text.trim();
+        if trimmed.eq_ignore_ascii_case("all") {
+            return Ok(Selection::All);
+        }
+        if !trimmed.contains([',', '-']) {
+            return match number(trimmed)? {
+                0 => Err(bad("a count of 0 selects nothing".into())),
+                n => Ok(Selection::Count(n)),
+            };
+        }
+        let mut list = Vec::new();
+        for part in trimmed.split(',').filter(|part| !part.trim().is_empty()) {
+            match part.split_once('-') {
+                Some((a, b)) => {
+                    let (a, b) = (number(a)?, number(b)?);
+                    if a > b {
+                        return Err(bad(format!("the range {a}-{b} runs backwards")));
+                    }
+                    list.extend(a..=b);
+                }
+                None => list.push(number(part)?),
+            }
+        }
+        if list.is_empty() {
+            return Err(bad("no index".into()));
+        }
+        list.sort_unstable();
+        list.dedup();
+        Ok(Selection::List(list))
+    }
+}
+
+impl std::fmt::Display for Selection {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Selection::All => write!(f, "all"),
+            Selection::Count(n) => write!(f, "{n}"),
+            Selection::List(list) => {
+                let text: Vec<String> = list.iter().map(usize::to_string).collect();
+                write!(f, "{}{}", text.join(","), if list.len() == 1 { "," } else { "" })
+            }
+        }
+    }
+}
+
+/// Indices of `count` directions spread by farthest-point selection, ascending: the first is the one nearest to the mean
+/// direction (index 0 where the mean vanishes), each next is the one farthest from those chosen; the lower index wins a
+/// tie. All indices where `count` is no less than their number.
+pub fn farthest_points(directions: &[Vec3], count: usize) -> Vec<usize> {
+    if count >= directions.len() {
+        return (0..directions.len()).collect();
+    }
+    let mut chosen = Vec::with_capacity(count);
+    let mut nearest = vec![f32::INFINITY; directions.len()];
+    let mean = directions.iter().sum::<Vec3>() / directions.len() as f32;
+    // A mean this short says nothing: the directions surround the object.
+    let mut next = match mean.length() > 1e-3 {
+        true => first_largest(directions.iter().map(|d| d.dot(mean))),
+        false => 0,
+    };
+    while chosen.len() < count {
+        chosen.push(next);
+        for (gap, d) in nearest.iter_mut().zip(directions) {
+            *gap = gap.min(d.distance_squared(directions[next]));
+        }
+        for &i in &chosen {
+            nearest[i] = -1.0;
+        }
+        next = first_largest(nearest.iter().copied());
+    }
+    chosen.sort_unstable();
+    chosen
+}
+
+/// Index of the first largest value; 0 for none.
+fn first_largest(values: impl Iterator<Item = f32>) -> usize {
+    let mut best = (0, f32::NEG_INFINITY);
+    for (i, v) in values.enumerate() {
+        if v > best.1 {
+            best = (i, v);
+        }
+    }
+    best.0
+}
+
+impl Capture {
+    /// The capture with only some of its training views and lights; held-out views stay.
+    ///
+    /// `views` are indices into [`Capture::train`]; a count spreads them over the directions from the centre of the
+    /// scene to the cameras.
+    ///
+    /// `lights`: where the rig is shared (all views together have no more different lights than the fullest view alone),
+    /// the lights are listed in the order in which they first appear, a choice among them is made once, and each view
+    /// keeps what it has of it. Otherwise, as on a turntable, each view chooses for itself: an index is then the place
+    /// in the frame ([`Shot::light_index`]), a count spreads over the light directions of that view. A view that has
+    /// none of the chosen lights of a shared rig chooses for itself too, so that it is not lost; with a list it is left
+    /// out.
+    ///
+    /// Errors: an index that does not exist, a count of 0, or a choice that leaves no image.
+    pub fn select(&self, views: &Selection, lights: &Selection) -> Result<Capture, DatasetError> {
+        let centre = self.scene().centre;
+        let towards: Vec<Vec3> = self
+            .train
+            .iter()
+            .map(|view| (view.camera.pose.centre() - centre).try_normalize().unwrap_or(Vec3::Z))
+            .collect();
+        let kept = choose("views", views, &towards)?;
+        let mut train: Vec<View> = kept.into_iter().map(|i| self.train[i].clone()).collect();
+        match shared_rig(&self.train) {
+            Some(rig) => {
+                let directions: Vec<Vec3> = rig.iter().map(|light| light_direction(light, centre)).collect();
+                let chosen: Vec<LightKey> =
+                    choose("lights", lights, &directions)?.iter().map(|&i| key(&rig[i])).collect();
+                for view in &mut train {
+                    let present: Vec<Shot> =
+                        view.shots.iter().filter(|shot| chosen.contains(&key(&shot.light))).cloned().collect();
+                    match (present.is_empty(), lights) {
+                        (true, Selection::Count(n)) => spread_lights(view, *n, centre),
+                        _ => view.shots = present,
+                    }
+                }
+            }
+            None => {
+                if let Selection::List(list) = lights {
+                    let last = self.train.iter().flat_map(|v| &v.shots).map(|shot| shot.light_index).max().unwrap_or(0);
+                    in_range("lights", list, last + 1)?;
+                }
+                for view in &mut train {
+                    match lights {
+                        Selection::All => {}
+                        Selection::Count(0) => return Err(nothing("lights")),
+                        Selection::Count(n) => spread_lights(view, *n, centre),
+                        Selection::List(list) => view.shots.retain(|shot| list.contains(&shot.light_index)),
+                    }
+                }
+            }
+        }
+        train.retain(|view| !view.shots.is_empty());
+        if train.is_empty() {
+            return Err(nothing("lights"));
+        }
+        Ok(Capture { train, ..self.clone() })
+    }
+}
+
+fn spread_lights(view: &mut View, count: usize, centre: Vec3) {
+    let directions: Vec<Vec3> = view.shots.iter().map(|shot| light_direction(&shot.light, centre)).collect();
+    view.shots = farthest_points(&directions, count).into_iter().map(|i| view.shots[i].clone()).collect();
+}
+
+fn choose(what: &'static str, selection: &Selection, directions: &[Vec3]) -> Result<Vec<usize>, DatasetError> {
+    match selection {
+        Selection::All => Ok((0..directions.len()).collect()),
+        Selection::Count(0) => Err(nothing(what)),
+        Selection::Count(n) => Ok(farthest_points(directions, *n)),
+        Selection::List(list) => {
+            in_range(what, list, directions.len())?;
+            let mut list = list.clone();
+            list.sort_unstable();
+            list.dedup();
+            if list.is_empty() { Err(nothing(what)) } else { Ok(list) }
+        }
+    }
+}
+
+fn in_range(what: &'static str, list: &[usize], count: usize) -> Result<(), DatasetError> {
+    match list.iter().find(|&&i| i >= count) {
+        Some(i) => Err(DatasetError::Selection {
+            what,
+            reason: format!(
+                "index {i} does not exist, there are {count}: choose from 0 to {}",
+                count.saturating_sub(1)
+            ),
+        }),
+        None => Ok(()),
+    }
+}
+
+fn nothing(what: &'static str) -> DatasetError {
+    DatasetError::Selection { what, reason: "the selection leaves no image; choose at least one view and light".into() }
+}
+
+/// A light's position or direction, bit by bit; intensity is no part of it.
+type LightKey = (bool, [u32; 3]);
+
+fn key(light: &OlatLight) -> LightKey {
+    let (point, v) = match *light {
+        OlatLight::Point { position, .. } => (true, position),
+        OlatLight::Directional { direction, .. } => (false, direction),
+    };
+    // Adding zero makes -0 and 0 the same.
+    (point, v.to_array().map(|x| (x + 0.0).to_bits()))
+}
+
+/// The lights of the rig, in the order in which they first appear, if all views share one.
+pub(crate) fn shared_rig(views: &[View]) -> Option<Vec<OlatLight>> {
+    let mut lights = Vec::new();
+    let mut seen = BTreeMap::new();
+    for shot in views.iter().flat_map(|view| &view.shots) {
+        seen.entry(key(&shot.light)).or_insert_with(|| lights.push(shot.light));
+    }
+    let fullest = views.iter().map(|view| view.shots.len()).max().unwrap_or(0);
+    (lights.len() <= fullest).then_some(lights)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_selection_is_read_as_on_the_command_line() {
+        let parse = |s: &str| s.parse::<Selection>().unwrap();
+        assert_eq!(parse("3"), Selection::Count(3));
+        assert_eq!(parse("all"), Selection::All);
+        assert_eq!(parse("0,5,7"), Selection::List(vec![0, 5, 7]));
+        assert_eq!(parse("2,"), Selection::List(vec![2]));
+        assert_eq!(parse("0-7"), Selection::List((0..8).collect()));
+        assert_eq!(parse(" 9, 0-2,1 "), Selection::List(vec![0, 1, 2, 9]));
+        for bad in ["", "0", "-1", "x", ",", "7-3", "1-", "1e3", "99999999999", "0-4000000000"] {
+            let error = bad.parse::<Selection>().unwrap_err().to_string();
+            assert!(error.contains("write a count"), "{bad}: {error}");
+        }
+        for text in ["3", "all", "0,5,7", "2,"] {
+            assert_eq!(parse(text).to_string(), text);
+        }
+    }
+
+    #[test]
+    fn farthest_points_spread() {
+        let ring: Vec<Vec3> = (0..12)
+            .map(|i| Vec3::new((i as f32 * 30f32.to_radians()).cos(), (i as f32 * 30f32.to_radians()).sin(), 0.2))
+            .collect();
+        assert_eq!(farthest_points(&ring, 1).len(), 1);
+        let four = farthest_points(&ring, 4);
+        let gaps: Vec<usize> = (0..4).map(|i| (four[(i + 1) % 4] + 12 - four[i]) % 12).collect();
+        assert_eq!(gaps, [3; 4]);
+        assert_eq!(farthest_points(&ring, 99).len(), 12);
+        assert!(farthest_points(&[], 3).is_empty());
+        assert_eq!(farthest_points(&[Vec3::X; 3], 2), [0, 1], "equal directions are still different lights");
+    }
+}
