@@ -1,0 +1,521 @@
+//! The configuration of a run: every number of the method, with presets, read from TOML.
+//!
+//! A file may name a `base` preset and say only what differs. Unknown keys are errors, so that a typing mistake never
+//! silently leaves a default in place. Step numbers are fractions of the run's length unless the name says `steps`.
+use crate::ReconstructError;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Names of the built-in presets, the default first.
+pub const PRESETS: [&str; 3] = ["resolved", "sss-3dgs", "paper"];
+
+/// Everything that a run needs to know.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of the preset (or file) that this came from; for reports only.
+    pub name: String,
+    /// Length of the run in steps.
+    pub steps: u64,
+    /// Seed of every random choice.
+    pub seed: u64,
+    /// (view, light) pairs whose gradients are averaged in one step.
+    pub accumulate: u32,
+    /// Steps between checkpoints.
+    pub checkpoint_steps: u64,
+    /// How images are read.
+    pub input: Input,
+    /// How the Gaussians begin.
+    pub initial: Initial,
+    /// The rasteriser's constants.
+    pub splat: Splat,
+    /// Adam and its learning rates.
+    pub rates: Rates,
+    /// Surface shading.
+    pub shading: Shading,
+    /// Subsurface residual.
+    pub residual: Residual,
+    /// Ray-traced visibility.
+    pub visibility: Visibility,
+    /// Weights of the objective.
+    pub loss: Loss,
+    /// Density control.
+    pub density: Density,
+}
+
+/// Transfer of the stored images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StoredTransfer {
+    /// sRGB.
+    Srgb,
+    /// Power law, exponent 2.2.
+    Gamma22,
+    /// Linear.
+    Linear,
+}
+
+impl StoredTransfer {
+    /// The transfer function it names.
+    pub fn transfer(self) -> diamond_image::Transfer {
+        match self {
+            StoredTransfer::Srgb => diamond_image::Transfer::Srgb,
+            StoredTransfer::Gamma22 => diamond_image::Transfer::Gamma22,
+            StoredTransfer::Linear => diamond_image::Transfer::Linear,
+        }
+    }
+}
+
+/// How images are read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Input {
+    /// Transfer of the stored images.
+    pub transfer: StoredTransfer,
+    /// Bytes that decoded images may occupy at a time.
+    pub cache_bytes: usize,
+}
+
+/// Where the first Gaussians come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitialSource {
+    /// Point cloud if the capture has one, else the visual hull of the masks, else uniform in the scene's bounds.
+    Auto,
+    /// The capture's point cloud; an error if there is none.
+    Points,
+    /// Visual hull of the masks; an error if no view has a mask.
+    Hull,
+    /// Uniform in the scene's bounds.
+    Uniform,
+}
+
+/// Where the first normals come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitialNormals {
+    /// From the neighbourhood of each point, pointing outward.
+    Outward,
+    /// Uniform on the sphere.
+    Random,
+}
+
+/// How the Gaussians begin.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Initial {
+    /// Where the positions come from.
+    pub source: InitialSource,
+    /// At most this many Gaussians at the start.
+    pub count: usize,
+    /// Voxels along the longest side of the visual hull.
+    pub hull_resolution: usize,
+    /// Where the normals come from.
+    pub normals: InitialNormals,
+    /// Opacity, in (0, 1).
+    pub opacity: f32,
+    /// Thickness along the normal as a fraction of the width: 1 for round, less for flat Gaussians.
+    pub flatness: f32,
+}
+
+/// The rasteriser's constants.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Splat {
+    /// Variance added to every projected Gaussian, px².
+    pub low_pass: f32,
+    /// Opacity of one Gaussian at one pixel never exceeds this.
+    pub max_alpha: f32,
+    /// Contributions below this are skipped.
+    pub min_alpha: f32,
+    /// A pixel is finished when its transmittance falls below this.
+    pub min_transmittance: f32,
+    /// Near plane as a fraction of the smallest distance from a camera to the scene's centre.
+    pub near: f32,
+    /// Largest standard deviation of a Gaussian as a fraction of the scene's extent.
+    pub max_scale: f32,
+}
+
+/// Adam and its learning rates, per attribute.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rates {
+    /// Mean at the start, × scene extent.
+    pub mean: f32,
+    /// Mean at the end of its decay, × scene extent.
+    pub mean_final: f32,
+    /// Fraction of the run over which the mean's rate falls log-linearly.
+    pub mean_decay: f32,
+    /// Log-scale.
+    pub scale: f32,
+    /// Rotation.
+    pub rotation: f32,
+    /// Opacity logit.
+    pub opacity: f32,
+    /// Normal.
+    pub normal: f32,
+    /// Base colour, roughness, metalness, subsurfaceness logits.
+    pub material: f32,
+    /// SH visibility.
+    pub visibility_sh: f32,
+    /// Transfer vectors.
+    pub transfer: f32,
+    /// Latent codes.
+    pub codes: f32,
+    /// Networks at the start.
+    pub network: f32,
+    /// Networks at the end of the run (log-linear in between).
+    pub network_final: f32,
+    /// All Gaussian attributes but the mean fall log-linearly to this fraction of their rate at the end of the run.
+    pub attribute_final: f32,
+}
+
+/// Masking–shadowing variant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MaskingVariant {
+    /// Schlick's form with k = (r+1)²/8.
+    SchlickRoughness,
+    /// Exact Smith, separable.
+    SmithSeparable,
+    /// Exact Smith, height-correlated.
+    SmithCorrelated,
+    /// Schlick's form with k = α/2.
+    SchlickHalfAlpha,
+}
+
+/// Fresnel variant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FresnelVariant {
+    /// Schlick's fifth power.
+    Schlick,
+    /// The spherical-Gaussian fit.
+    SphericalGaussian,
+}
+
+/// Diffuse variant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DiffuseVariant {
+    /// (1−m)·c/π.
+    Lambert,
+    /// (1−F)·0.96·(1−m)·c/π.
+    FresnelWeighted,
+}
+
+/// What lights the surface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum IncidentVariant {
+    /// The network's incident head times the light's intensity.
+    Learned,
+    /// Inverse-square falloff about `incident_reference`.
+    InverseSquare,
+    /// The intensity, without falloff.
+    None,
+}
+
+/// How surface and residual are combined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CombineVariant {
+    /// (1−s)·surface + s·residual.
+    Lerp,
+    /// surface + s·residual.
+    Additive,
+}
+
+/// Surface shading.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Shading {
+    /// Masking–shadowing.
+    pub masking: MaskingVariant,
+    /// Fresnel.
+    pub fresnel: FresnelVariant,
+    /// Diffuse.
+    pub diffuse: DiffuseVariant,
+    /// Incident light.
+    pub incident: IncidentVariant,
+    /// Distance at which irradiance equals intensity, scene units; 0 means the mean light distance of the capture.
+    pub incident_reference: f32,
+    /// Height of the warm-up offset on learned incident light (4 in the predecessor).
+    pub incident_warm_up: f32,
+    /// Fraction of the run over which the offset rises (it falls over the next such fraction).
+    pub incident_warm_up_fraction: f32,
+    /// Whether the offset falls back to 0 at once, as in the predecessor.
+    pub incident_warm_up_drop: bool,
+    /// How surface and residual are combined.
+    pub combine: CombineVariant,
+    /// Divide the G-buffer by opacity before shading.
+    pub normalise: bool,
+    /// Multiply the surface term by visibility.
+    pub surface_visibility: bool,
+    /// Light that leaks below the horizon.
+    pub horizon_leak: f32,
+    /// Roughness is the constant 0.5 until this fraction of the run.
+    pub roughness_unfreeze: f32,
+}
+
+/// Subsurface residual.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Residual {
+    /// Whether the network is used.
+    pub network: bool,
+    /// Hidden widths of the trunk.
+    pub hidden: Vec<usize>,
+    /// Leak of the hidden activations; 0 for ReLU.
+    pub leak: f32,
+    /// Whether the incident head passes its gradient on.
+    pub incident_gradient: bool,
+    /// Multiply the residual by the light's intensity (and falloff, where physical), which keeps it linear in light.
+    pub scale_by_light: bool,
+    /// Learned latent values per Gaussian that the network reads.
+    pub codes: usize,
+    /// Degree of the per-Gaussian SH transfer vectors; absent for none.
+    pub transfer_degree: Option<u32>,
+    /// L2 shrinkage of the transfer vectors of degree l, × l².
+    pub transfer_smoothness: f32,
+}
+
+/// Ray-traced visibility.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Visibility {
+    /// Whether rays are traced at all (else the SH fit alone is used).
+    pub traced: bool,
+    /// A light's visibility is traced again when it is older than this many steps.
+    pub every_steps: u64,
+    /// Random Gaussians per step on which the SH fit is compared.
+    pub samples: usize,
+}
+
+/// Weights of the objective.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Loss {
+    /// Space in which radiance is compared.
+    pub space: StoredTransfer,
+    /// λ of 1−SSIM; L1 has 1−λ.
+    pub ssim: f32,
+    /// Squared error in the same space.
+    pub l2: f32,
+    /// Mask cross-entropy.
+    pub mask: f32,
+    /// Normal against pseudo-normal.
+    pub normal: f32,
+    /// Smoothness of base colour.
+    pub smooth_base_color: f32,
+    /// Smoothness of metalness.
+    pub smooth_metalness: f32,
+    /// Smoothness of roughness.
+    pub smooth_roughness: f32,
+    /// Smoothness of subsurfaceness.
+    pub smooth_subsurfaceness: f32,
+    /// Base colour toward the enhanced photograph.
+    pub enhancement: f32,
+    /// Incident light against visibility.
+    pub incident: f32,
+    /// SH visibility against traced visibility.
+    pub visibility: f32,
+    /// LPIPS (0 without weights).
+    pub lpips: f32,
+}
+
+/// Density control.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Density {
+    /// Whether Gaussians are added and removed.
+    pub enabled: bool,
+    /// Steps between two rounds.
+    pub every_steps: u64,
+    /// First round, fraction of the run.
+    pub from: f32,
+    /// Last round, fraction of the run.
+    pub until: f32,
+    /// Mean screen-space positional gradient (NDC) at which a Gaussian is cloned or split.
+    pub gradient_threshold: f32,
+    /// Largest scale (× extent) that is cloned rather than split.
+    pub percent_dense: f32,
+    /// Opacity below which a Gaussian is pruned.
+    pub prune_opacity: f32,
+    /// Opacity is reset every this fraction of the run; 0 for never.
+    pub reset_every: f32,
+    /// Opacity after a reset.
+    pub reset_opacity: f32,
+    /// Never more Gaussians than this.
+    pub max_gaussians: usize,
+}
+
+fn preset_text(name: &str) -> Option<&'static str> {
+    match name {
+        "resolved" => Some(include_str!("../presets/resolved.toml")),
+        "sss-3dgs" => Some(include_str!("../presets/sss-3dgs.toml")),
+        "paper" => Some(include_str!("../presets/paper.toml")),
+        _ => None,
+    }
+}
+
+/// Lays `over` onto `base`, table by table.
+fn merge(base: &mut toml::Table, over: toml::Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(toml::Value::Table(inner)), toml::Value::Table(value)) => merge(inner, value),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
+    }
+}
+
+fn table_of(text: &str, origin: &str) -> Result<toml::Table, ReconstructError> {
+    let fail = |detail: String| ReconstructError::Config { origin: origin.to_owned(), detail };
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| fail(e.to_string()))?;
+    let Some(base) = table.remove("base") else { return Ok(table) };
+    let name = base.as_str().ok_or_else(|| fail(format!("`base` must be the name of a preset, found {base}")))?;
+    let text = preset_text(name)
+        .ok_or_else(|| fail(format!("`base = \"{name}\"` is not a preset; expected one of {}", PRESETS.join(", "))))?;
+    let mut merged = table_of(text, name)?;
+    merge(&mut merged, table);
+    Ok(merged)
+}
+
+impl Config {
+    /// A built-in preset, one of [`PRESETS`].
+    pub fn preset(name: &str) -> Result<Self, ReconstructError> {
+        let text = preset_text(name).ok_or_else(|| ReconstructError::Config {
+            origin: name.to_owned(),
+            detail: format!("no such preset; expected one of {} or a file ending in .toml", PRESETS.join(", ")),
+        })?;
+        Self::parse(text, name)
+    }
+
+    /// A preset by name, or a TOML file by path (anything that ends in `.toml`).
+    pub fn load(preset_or_path: &str) -> Result<Self, ReconstructError> {
+        if !preset_or_path.ends_with(".toml") {
+            return Self::preset(preset_or_path);
+        }
+        let path = Path::new(preset_or_path);
+        let text = std::fs::read_to_string(path)
+            .map_err(|e| ReconstructError::Io { path: path.to_owned(), action: "read the configuration", source: e })?;
+        Self::parse(&text, preset_or_path)
+    }
+
+    /// Parses TOML text; `origin` names it in errors. A file without `base` starts from `resolved`.
+    pub fn parse(text: &str, origin: &str) -> Result<Self, ReconstructError> {
+        let mut table = table_of(text, origin)?;
+        if preset_text(origin).is_none() && !text.lines().any(|l| l.trim_start().starts_with("base")) {
+            let mut merged = table_of(include_str!("../presets/resolved.toml"), "resolved")?;
+            merge(&mut merged, table);
+            table = merged;
+        }
+        let config: Config = toml::Value::Table(table)
+            .try_into()
+            .map_err(|e: toml::de::Error| ReconstructError::Config { origin: origin.into(), detail: e.to_string() })?;
+        config.validate(origin)?;
+        Ok(config)
+    }
+
+    /// The configuration as TOML text, complete.
+    pub fn to_toml(&self) -> Result<String, ReconstructError> {
+        toml::to_string_pretty(self)
+            .map_err(|e| ReconstructError::Config { origin: self.name.clone(), detail: e.to_string() })
+    }
+
+    /// Checks ranges; `origin` names the file in errors.
+    pub fn validate(&self, origin: &str) -> Result<(), ReconstructError> {
+        let fail = |detail: String| Err(ReconstructError::Config { origin: origin.to_owned(), detail });
+        let positive = [
+            ("steps", self.steps as f32),
+            ("accumulate", self.accumulate as f32),
+            ("checkpoint_steps", self.checkpoint_steps as f32),
+            ("initial.count", self.initial.count as f32),
+            ("splat.max_scale", self.splat.max_scale),
+            ("density.every_steps", self.density.every_steps as f32),
+            ("visibility.every_steps", self.visibility.every_steps as f32),
+        ];
+        for (key, value) in positive {
+            if value.is_nan() || value <= 0.0 {
+                return fail(format!("`{key}` must be greater than 0, found {value}"));
+            }
+        }
+        let unit = [
+            ("initial.opacity", self.initial.opacity),
+            ("initial.flatness", self.initial.flatness),
+            ("splat.max_alpha", self.splat.max_alpha),
+            ("density.prune_opacity", self.density.prune_opacity),
+            ("density.from", self.density.from),
+            ("density.until", self.density.until),
+            ("density.reset_every", self.density.reset_every),
+            ("shading.roughness_unfreeze", self.shading.roughness_unfreeze),
+            ("rates.mean_decay", self.rates.mean_decay),
+            ("loss.ssim", self.loss.ssim),
+        ];
+        for (key, value) in unit {
+            if !(0.0..=1.0).contains(&value) {
+                return fail(format!("`{key}` must lie in [0, 1], found {value}"));
+            }
+        }
+        if self.initial.opacity <= 0.0 || self.initial.opacity >= 1.0 {
+            return fail(format!("`initial.opacity` must lie strictly between 0 and 1, found {}", self.initial.opacity));
+        }
+        if let Some(degree) = self.residual.transfer_degree.filter(|d| *d > 3) {
+            return fail(format!("`residual.transfer_degree` must be at most 3, found {degree}"));
+        }
+        let losses = [
+            ("l2", self.loss.l2),
+            ("mask", self.loss.mask),
+            ("normal", self.loss.normal),
+            ("smooth_base_color", self.loss.smooth_base_color),
+            ("smooth_metalness", self.loss.smooth_metalness),
+            ("smooth_roughness", self.loss.smooth_roughness),
+            ("smooth_subsurfaceness", self.loss.smooth_subsurfaceness),
+            ("enhancement", self.loss.enhancement),
+            ("incident", self.loss.incident),
+            ("visibility", self.loss.visibility),
+            ("lpips", self.loss.lpips),
+        ];
+        for (key, value) in losses {
+            if !value.is_finite() || value < 0.0 {
+                return fail(format!("`loss.{key}` must be finite and not negative, found {value}"));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_parse_and_survive_a_round_trip() {
+        for name in PRESETS {
+            let config = Config::preset(name).unwrap();
+            assert_eq!(config.name, name);
+            let again = Config::parse(&config.to_toml().unwrap(), "round trip").unwrap();
+            assert_eq!(config, again);
+        }
+    }
+
+    #[test]
+    fn a_file_says_only_what_differs() {
+        let config = Config::parse("base = \"paper\"\nsteps = 7\n[loss]\nmask = 0.25\n", "mine.toml").unwrap();
+        let paper = Config::preset("paper").unwrap();
+        assert_eq!((config.steps, config.loss.mask, config.loss.ssim), (7, 0.25, paper.loss.ssim));
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let error = |text: &str| Config::parse(text, "mine.toml").unwrap_err().to_string();
+        assert!(error("[loss]\nmaks = 1.0").contains("maks"), "{}", error("[loss]\nmaks = 1.0"));
+        assert!(error("steps = 0").contains("steps"));
+        assert!(error("base = \"nope\"").contains("nope"));
+        assert!(error("[loss]\nmask = -1.0").contains("loss.mask"));
+        assert!(error("[initial]\nopacity = 1.0").contains("initial.opacity"));
+        assert!(error("steps = \"many\"").contains("mine.toml"));
+    }
+}

@@ -1,0 +1,364 @@
+//! The CPU engine: one training step, written out in order.
+//!
+//! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
+use crate::forward::{self, Forward};
+use crate::objective::{self, Terms};
+use crate::random::{Purpose, Random};
+use crate::visibility_cache::VisibilityCache;
+use crate::{
+    Activated, ActivatedGrad, Attribute, Engine, Model, ReconstructError, Rendering, StepPlan, StepReport, TensorFile,
+    TrainingPair, adam, error, logit,
+};
+use diamond_camera::Camera;
+use diamond_light::OlatLight;
+use diamond_splat::{
+    DensityConfig, DensityStats, GaussiansGrad, OriginKind, plan_density, split_child,
+};
+use std::path::Path;
+use std::time::Instant;
+
+/// Smallest standard deviation, × scene extent: below this a Gaussian is a point and its conic loses all digits.
+const MIN_SCALE: f32 = 1e-6;
+
+/// The training step and renderer on the CPU.
+pub struct CpuEngine {
+    model: Model,
+    visibility: VisibilityCache,
+    stats: DensityStats,
+    profile: Profile,
+}
+
+/// Seconds per part of a step.
+#[derive(Debug, Clone, Default)]
+pub struct Profile {
+    parts: Vec<(&'static str, f64)>,
+}
+
+impl Profile {
+    /// Adds the time since `since` to `part` and returns now.
+    pub(crate) fn add(&mut self, part: &'static str, since: Instant) -> Instant {
+        let now = Instant::now();
+        let seconds = (now - since).as_secs_f64();
+        match self.parts.iter_mut().find(|(name, _)| *name == part) {
+            Some((_, total)) => *total += seconds,
+            None => self.parts.push((part, seconds)),
+        }
+        now
+    }
+}
+
+impl CpuEngine {
+    /// An engine that trains `model` further.
+    pub fn new(model: Model) -> Self {
+        let stats = DensityStats::new(model.len());
+        Self { model, visibility: VisibilityCache::default(), stats, profile: Profile::default() }
+    }
+
+    fn check_gradients(&self, gradients: &[Vec<f32>], step: u64) -> Result<(), ReconstructError> {
+        for (attribute, gradient) in Attribute::ALL.iter().zip(gradients) {
+            if let Some(i) = gradient.iter().position(|g| !g.is_finite()) {
+                let width = self.model.parameters.group(*attribute).width.max(1);
+                return Err(ReconstructError::NonFinite {
+                    what: format!("the gradient of `{}`", attribute.name()),
+                    step,
+                    detail: format!("Gaussian {}, component {}: {}", i / width, i % width, gradient[i]),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn apply(
+        &mut self,
+        step: u64,
+        plan: &StepPlan,
+        activated: &Activated,
+        grad: &ActivatedGrad,
+        network: &[Vec<f32>],
+    ) -> Result<(), ReconstructError> {
+        let gradients = self.model.parameters.pull(activated, grad);
+        self.check_gradients(&gradients, step)?;
+        let rates = self.model.config.rates.clone();
+        let extent = self.model.scene.extent;
+        let factor = plan.attribute_factor;
+        let frozen = plan.roughness_frozen;
+        self.model.parameters.adam_step(
+            &gradients,
+            |attribute| match attribute {
+                Attribute::Mean => plan.mean_rate * extent,
+                Attribute::Scale => rates.scale * factor,
+                Attribute::Rotation => rates.rotation * factor,
+                Attribute::Opacity => rates.opacity * factor,
+                Attribute::Normal => rates.normal * factor,
+                Attribute::Roughness if frozen => 0.0,
+                Attribute::BaseColor | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => {
+                    rates.material * factor
+                }
+                Attribute::VisibilitySh => rates.visibility_sh * factor,
+                Attribute::Transfer => rates.transfer * factor,
+                Attribute::Codes => rates.codes * factor,
+            },
+            step + 1,
+        );
+        let low = (MIN_SCALE * extent).ln();
+        let high = (self.model.config.splat.max_scale * extent).ln();
+        self.model.parameters.values_mut(Attribute::Scale).iter_mut().for_each(|s| *s = s.clamp(low, high));
+        if let Some(model_network) = &mut self.model.network {
+            let parts = crate::model::network_parts_mut(model_network);
+            for (((name, values), moments), gradient) in
+                parts.into_iter().zip(&mut self.model.network_moments).zip(network)
+            {
+                if let Some(i) = gradient.iter().position(|g| !g.is_finite()) {
+                    return Err(ReconstructError::NonFinite {
+                        what: format!("the gradient of the network's {name}"),
+                        step,
+                        detail: format!("parameter {i}: {}", gradient[i]),
+                    });
+                }
+                adam::adam_step(values, moments, gradient, plan.network_rate, step + 1);
+            }
+        }
+        if let Some((attribute, i)) = self.model.parameters.first_non_finite() {
+            return Err(ReconstructError::NonFinite {
+                what: format!("`{}`", attribute.name()),
+                step,
+                detail: format!("Gaussian {i}"),
+            });
+        }
+        Ok(())
+    }
+
+    /// Clones, splits and prunes; returns how many of each.
+    fn densify(&mut self, step: u64) -> Result<[usize; 3], ReconstructError> {
+        let d = &self.model.config.density;
+        let config = DensityConfig {
+            gradient_threshold: d.gradient_threshold,
+            percent_dense: d.percent_dense,
+            prune_opacity: d.prune_opacity,
+            max_gaussians: Some(d.max_gaussians),
+            ..Default::default()
+        };
+        let extent = self.model.scene.extent;
+        let activated = self.model.parameters.activate();
+        let g = &activated.gaussians;
+        let plan = plan_density(g, &self.stats, &config, extent).map_err(error::stage("density control"))?;
+        if plan.origins.is_empty() {
+            // Everything would be pruned (an all-black capture, say): keep the set rather than end with nothing.
+            self.stats = DensityStats::new(self.model.len());
+            return Ok([0, 0, 0]);
+        }
+        let sources: Vec<(u32, bool)> = plan.origins.iter().map(|o| (o.source, o.kind == OriginKind::Kept)).collect();
+        let mut parameters = self.model.parameters.gather(&sources);
+        let mut random = Random::new(self.model.config.seed, Purpose::Split, step);
+        for (i, origin) in plan.origins.iter().enumerate() {
+            if origin.kind == OriginKind::SplitChild {
+                let s = origin.source as usize;
+                let (mean, scale) = split_child(
+                    g.means[s],
+                    g.scales[s],
+                    g.rotations[s],
+                    random.normal3(),
+                    config.split_divisor,
+                );
+                parameters.values_mut(Attribute::Mean)[3 * i..3 * i + 3].copy_from_slice(&mean.to_array());
+                let log = [scale.x.ln(), scale.y.ln(), scale.z.ln()];
+                parameters.values_mut(Attribute::Scale)[3 * i..3 * i + 3].copy_from_slice(&log);
+            }
+        }
+        self.model.parameters = parameters;
+        self.visibility.gather(&sources);
+        self.stats = DensityStats::new(self.model.len());
+        Ok([plan.cloned, plan.split, plan.pruned])
+    }
+
+    fn reset_opacity(&mut self) {
+        let ceiling = logit(self.model.config.density.reset_opacity);
+        let group = self.model.parameters.group_mut(Attribute::Opacity);
+        group.values.iter_mut().for_each(|v| *v = v.min(ceiling));
+        group.moments.first.fill(0.0);
+        group.moments.second.fill(0.0);
+    }
+}
+
+impl Engine for CpuEngine {
+    fn name(&self) -> &str {
+        "cpu"
+    }
+
+    fn training_step(
+        &mut self,
+        step: u64,
+        plan: &StepPlan,
+        batch: &[TrainingPair<'_>],
+    ) -> Result<StepReport, ReconstructError> {
+        let start = Instant::now();
+        let n = self.model.len();
+        let activated = self.model.parameters.activate();
+        let mut total = ActivatedGrad { gaussians: GaussiansGrad::zeros(n), ..Default::default() };
+        let mut network_grad: Vec<Vec<f32>> = Vec::new();
+        let mut terms = Terms::default();
+        let mut psnr = 0.0;
+        let mut visible = 0;
+        self.profile.add("activate", start);
+        let share = 1.0 / batch.len().max(1) as f32;
+        for pair in batch {
+            let settings = forward::Settings::training(&self.model, plan);
+            let traced = match self.model.config.visibility.traced {
+                true => {
+                    let t = Instant::now();
+                    let v = self.visibility.get(
+                        &self.model.config,
+                        &activated.gaussians,
+                        &activated.normals,
+                        pair.light,
+                        step,
+                    )?;
+                    self.profile.add("visibility", t);
+                    Some(v)
+                }
+                false => None,
+            };
+            let light = self.model.scene.scaled_light(pair.light);
+            let forward = Forward::run(&self.model, &activated, pair.camera, &light, traced, &settings, &mut self.profile)?;
+            let t = Instant::now();
+            let outcome = objective::evaluate(&self.model.config, plan, &forward, pair, share)?;
+            self.profile.add("objective", t);
+            terms.add(&outcome.terms, share);
+            psnr += outcome.psnr * share;
+            visible = forward.visible().len();
+            let pulled = forward.pull(&outcome.grad, &mut self.profile)?;
+            let t = Instant::now();
+            if plan.collect_density {
+                let k = &pair.camera.intrinsics;
+                self.stats
+                    .add(&pulled.screen, &pulled.radii, pulled.visible.as_slice(), k.width as usize, k.height as usize)
+                    .map_err(error::stage("density statistics"))?;
+            }
+            pulled.add_to(&mut total, &mut network_grad)?;
+            self.profile.add("accumulate", t);
+            if let (Some(traced), true) = (traced, self.model.config.loss.visibility > 0.0) {
+                let t = Instant::now();
+                let mut random = Random::new(self.model.config.seed, Purpose::VisibilitySamples, step);
+                let value =
+                    objective::visibility_term(&self.model, &mut random, &light, traced, share, &mut total.visibility_sh)?;
+                terms.add(&[value], share);
+                self.profile.add("visibility term", t);
+            }
+        }
+        objective::regularise(&self.model, &mut total, &mut terms);
+        let objective_value = terms.objective();
+        if !objective_value.is_finite() {
+            let culprit = terms.values.iter().find(|t| !t.value.is_finite());
+            return Err(ReconstructError::NonFinite {
+                what: format!("the loss term `{}`", culprit.map_or("objective", |t| t.name)),
+                step,
+                detail: format!("{objective_value}"),
+            });
+        }
+        let t = Instant::now();
+        self.apply(step, plan, &activated, &total, &network_grad)?;
+        let t = self.profile.add("adam", t);
+        let mut density = [0; 3];
+        if plan.densify {
+            density = self.densify(step)?;
+        }
+        if plan.reset_opacity {
+            self.reset_opacity();
+        }
+        self.profile.add("density control", t);
+        Ok(StepReport {
+            step,
+            objective: objective_value,
+            terms: terms.values,
+            psnr,
+            gaussians: self.model.len(),
+            visible,
+            density,
+        })
+    }
+
+    fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
+        forward::render(&self.model, camera, lights)
+    }
+
+    fn model(&mut self) -> Result<&Model, ReconstructError> {
+        Ok(&self.model)
+    }
+
+    fn state(&mut self) -> Result<TensorFile, ReconstructError> {
+        let mut file = TensorFile::default();
+        let n = self.model.len();
+        for group in self.model.parameters.groups() {
+            let name = group.attribute.name();
+            let shape = [n, group.width];
+            file.insert(format!("gaussians.{name}"), &shape, group.values.clone());
+            file.insert(format!("gaussians.{name}.first_moment"), &shape, group.moments.first.clone());
+            file.insert(format!("gaussians.{name}.second_moment"), &shape, group.moments.second.clone());
+        }
+        for ((name, values), moments) in self.model.network_tensors().into_iter().zip(&self.model.network_moments) {
+            let shape = [values.len()];
+            file.insert(format!("network.{name}"), &shape, values.to_vec());
+            file.insert(format!("network.{name}.first_moment"), &shape, moments.first.clone());
+            file.insert(format!("network.{name}.second_moment"), &shape, moments.second.clone());
+        }
+        for (key, step, values) in self.visibility.entries() {
+            let name = key.iter().map(|k| format!("{k:08x}")).collect::<Vec<_>>().join("-");
+            file.insert(format!("visibility.{name}"), &[values.len()], values.to_vec());
+            file.metadata.insert(format!("visibility.{name}.step"), step.to_string());
+        }
+        let (gradient_sums, counts, radii) = self.stats.to_parts();
+        file.insert("density.gradient_sums", &[n], gradient_sums);
+        file.insert("density.counts", &[n], counts);
+        file.insert("density.radii", &[n], radii);
+        file.metadata.insert("gaussians".into(), n.to_string());
+        Ok(file)
+    }
+
+    fn restore(&mut self, path: &Path, mut state: TensorFile) -> Result<(), ReconstructError> {
+        let n: usize = state.metadata_value(path, "gaussians")?;
+        let config = &self.model.config;
+        let transfer = crate::model::transfer_width(config.residual.transfer_degree);
+        let mut parameters = crate::GaussianParameters::zeros(n, transfer, config.residual.codes);
+        for attribute in Attribute::ALL {
+            let group = parameters.group_mut(attribute);
+            let (name, size) = (attribute.name(), n * group.width);
+            group.values = state.take(path, &format!("gaussians.{name}"), size)?;
+            group.moments.first = state.take(path, &format!("gaussians.{name}.first_moment"), size)?;
+            group.moments.second = state.take(path, &format!("gaussians.{name}.second_moment"), size)?;
+        }
+        if let Some(network) = &mut self.model.network {
+            let parts = crate::model::network_parts_mut(network);
+            for ((name, values), moments) in parts.into_iter().zip(&mut self.model.network_moments) {
+                let size = values.len();
+                *values = state.take(path, &format!("network.{name}"), size)?;
+                moments.first = state.take(path, &format!("network.{name}.first_moment"), size)?;
+                moments.second = state.take(path, &format!("network.{name}.second_moment"), size)?;
+            }
+        }
+        let parts = ["density.gradient_sums", "density.counts", "density.radii"];
+        let [sums, counts, radii] = parts.map(|name| state.take(path, name, n));
+        self.stats = DensityStats::from_parts(sums?, counts?, radii?).map_err(error::stage("density statistics"))?;
+        self.visibility = VisibilityCache::default();
+        let names: Vec<String> = state.tensors.keys().filter(|k| k.starts_with("visibility.")).cloned().collect();
+        for name in names {
+            let bad = || ReconstructError::Checkpoint {
+                path: path.to_owned(),
+                detail: format!("tensor `{name}`: its name does not identify a light"),
+            };
+            let fields: Vec<u32> = name["visibility.".len()..]
+                .split('-')
+                .map(|h| u32::from_str_radix(h, 16).map_err(|_| bad()))
+                .collect::<Result<_, _>>()?;
+            let key: [u32; 4] = fields.try_into().map_err(|_| bad())?;
+            let step = state.metadata_value(path, &format!("{name}.step"))?;
+            let values = state.take(path, &name, n)?;
+            self.visibility.restore(key, step, values);
+        }
+        self.model.parameters = parameters;
+        Ok(())
+    }
+
+    fn profile(&self) -> Vec<(&'static str, f64)> {
+        self.profile.parts.clone()
+    }
+}

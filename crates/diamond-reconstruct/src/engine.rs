@@ -1,0 +1,86 @@
+//! What runs a training step and renders: the CPU now, a GPU later, behind one trait.
+use crate::objective::TermValue;
+use crate::{Model, ReconstructError, StepPlan, TensorFile};
+use diamond_camera::Camera;
+use diamond_image::{Image, Mask};
+use diamond_light::OlatLight;
+use diamond_shading::deferred::ShadedMaps;
+use std::path::Path;
+
+/// One photograph to learn from.
+#[derive(Debug, Clone, Copy)]
+pub struct TrainingPair<'a> {
+    /// Where it was taken from.
+    pub camera: &'a Camera,
+    /// What lit it.
+    pub light: &'a OlatLight,
+    /// Linear RGB over black, the camera's size.
+    pub radiance: &'a Image,
+    /// Coverage, where known.
+    pub mask: Option<&'a Mask>,
+    /// Weight in the photometric terms (1 for photographs).
+    pub weight: f32,
+}
+
+/// What one training step did.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct StepReport {
+    /// Number of the step, from 0.
+    pub step: u64,
+    /// Weighted sum of all terms.
+    pub objective: f32,
+    /// Each term: name, weight, value (mean over the batch).
+    pub terms: Vec<TermValue>,
+    /// PSNR of the rendered training images in display sRGB, all pixels, dB.
+    pub psnr: f32,
+    /// Gaussians after the step.
+    pub gaussians: usize,
+    /// Gaussians that could contribute to the last view.
+    pub visible: usize,
+    /// Gaussians cloned, split and pruned after this step.
+    pub density: [usize; 3],
+}
+
+/// A view under one light.
+#[derive(Debug, Clone)]
+pub struct Rendering {
+    /// Linear RGB over black.
+    pub radiance: Image,
+    /// Surface part, linear RGB over black.
+    pub surface: Image,
+    /// Subsurface part, linear RGB over black.
+    pub subsurface: Image,
+    /// Opacity.
+    pub opacity: Image,
+    /// Material, normal, visibility and depth maps.
+    pub maps: ShadedMaps,
+}
+
+/// Runs training steps and renders. The CPU implementation is [`crate::CpuEngine`].
+pub trait Engine {
+    /// Name for logs: `cpu` or a device's.
+    fn name(&self) -> &str;
+
+    /// One step: forward and backward over the batch, Adam, density control as `plan` says.
+    fn training_step(
+        &mut self,
+        step: u64,
+        plan: &StepPlan,
+        batch: &[TrainingPair<'_>],
+    ) -> Result<StepReport, ReconstructError>;
+
+    /// Renders one camera under each light.
+    fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError>;
+
+    /// The model as it stands.
+    fn model(&mut self) -> Result<&Model, ReconstructError>;
+
+    /// Everything that the next step depends on.
+    fn state(&mut self) -> Result<TensorFile, ReconstructError>;
+
+    /// Puts back what [`Engine::state`] gave; `path` names the file in errors.
+    fn restore(&mut self, path: &Path, state: TensorFile) -> Result<(), ReconstructError>;
+
+    /// Seconds spent so far in each part of a step, in order.
+    fn profile(&self) -> Vec<(&'static str, f64)>;
+}

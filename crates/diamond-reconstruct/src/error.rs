@@ -1,0 +1,92 @@
+//! What can go wrong, who is at fault, and what to do.
+use std::path::PathBuf;
+
+/// Errors of this crate.
+#[derive(Debug)]
+pub enum ReconstructError {
+    /// The configuration is wrong.
+    Config {
+        /// Preset or file.
+        origin: String,
+        /// What was expected and found.
+        detail: String,
+    },
+    /// The capture cannot be used.
+    Capture(diamond_dataset::DatasetError),
+    /// The capture is readable but lacks what the run needs.
+    Unusable {
+        /// What is missing and what to do.
+        detail: String,
+    },
+    /// A file operation failed.
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What was being done.
+        action: &'static str,
+        /// The operating system's answer.
+        source: std::io::Error,
+    },
+    /// A checkpoint or model file is not what it should be.
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What was expected, what was found, what to do.
+        detail: String,
+    },
+    /// A NaN or infinity appeared; the run stops with the culprit named.
+    NonFinite {
+        /// Where: an attribute, a loss term, a network.
+        what: String,
+        /// Step number.
+        step: u64,
+        /// Index and value of the first offender.
+        detail: String,
+    },
+    /// A lower crate refused its input: a mistake of ours rather than of the user's.
+    Internal {
+        /// Which stage.
+        stage: &'static str,
+        /// Its message.
+        detail: String,
+    },
+}
+
+impl std::fmt::Display for ReconstructError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Config { origin, detail } => write!(f, "configuration {origin}: {detail}"),
+            Self::Capture(e) => write!(f, "{e}"),
+            Self::Unusable { detail } => write!(f, "{detail}"),
+            Self::Io { path, action, source } => write!(f, "{}: could not {action}: {source}", path.display()),
+            Self::Checkpoint { path, detail } => write!(f, "{}: {detail}", path.display()),
+            Self::NonFinite { what, step, detail } => write!(
+                f,
+                "step {step}: {what} is not finite ({detail}); the run was stopped, the last checkpoint is intact: \
+                 lower the learning rates or report the capture"
+            ),
+            Self::Internal { stage, detail } => write!(f, "stage {stage}: {detail}"),
+        }
+    }
+}
+
+impl std::error::Error for ReconstructError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Capture(e) => Some(e),
+            Self::Io { source, .. } => Some(source),
+            _ => None,
+        }
+    }
+}
+
+impl From<diamond_dataset::DatasetError> for ReconstructError {
+    fn from(e: diamond_dataset::DatasetError) -> Self {
+        Self::Capture(e)
+    }
+}
+
+/// Turns the error of a lower crate into [`ReconstructError::Internal`] with the stage's name.
+pub(crate) fn stage<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> ReconstructError {
+    move |e| ReconstructError::Internal { stage, detail: e.to_string() }
+}

@@ -1,0 +1,196 @@
+//! The run: which pair comes next, when to checkpoint, how to resume.
+use crate::pairs::PairOrder;
+use crate::scene::{self, InitialPoints};
+use crate::tensor_file::TensorFile;
+use crate::{Config, CpuEngine, Engine, Model, ReconstructError, Rendering, Scene, StepPlan, StepReport, TrainingPair};
+use diamond_camera::Camera;
+use diamond_dataset::{Capture, Observation};
+use diamond_light::OlatLight;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A reconstruction in progress.
+pub struct Reconstruction {
+    capture: Capture,
+    config: Config,
+    engine: Box<dyn Engine>,
+    pairs: Vec<(usize, usize)>,
+    order: PairOrder,
+    step: u64,
+    /// Where the first Gaussians came from, for the log.
+    pub initial_origin: String,
+}
+
+/// Name of the checkpoint's file inside its folder.
+const STATE_FILE: &str = "state.safetensors";
+
+impl Reconstruction {
+    /// Surveys the capture (its selected training part) and makes the model before the first step.
+    pub fn new(capture: Capture, config: &Config) -> Result<Self, ReconstructError> {
+        let (scene, points) = scene::survey(&capture, config)?;
+        Self::from_points(capture, config, scene, &points)
+    }
+
+    fn from_points(
+        capture: Capture,
+        config: &Config,
+        scene: Scene,
+        points: &InitialPoints,
+    ) -> Result<Self, ReconstructError> {
+        let model = Model::initial(config, scene, points)?;
+        let pairs: Vec<(usize, usize)> = capture
+            .train
+            .iter()
+            .enumerate()
+            .flat_map(|(v, view)| (0..view.shots.len()).map(move |s| (v, s)))
+            .collect();
+        if pairs.is_empty() {
+            return Err(ReconstructError::Unusable {
+                detail: "the selection holds no image; choose at least one view and one light".into(),
+            });
+        }
+        let order = PairOrder::new(config.seed, pairs.len());
+        Ok(Self {
+            capture,
+            config: config.clone(),
+            engine: Box::new(CpuEngine::new(model)),
+            pairs,
+            order,
+            step: 0,
+            initial_origin: points.origin.clone(),
+        })
+    }
+
+    /// Continues from the checkpoint in `folder`, bit for bit as if the run had not been interrupted. The configuration
+    /// and the capture must be the ones that it was made with.
+    pub fn resume(capture: Capture, config: &Config, folder: &Path) -> Result<Self, ReconstructError> {
+        let path = folder.join(STATE_FILE);
+        let file = TensorFile::read(&path)?;
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.clone(), detail };
+        let then: String = file.metadata_value(&path, "config")?;
+        if then != config.to_toml()? {
+            return Err(fail(
+                "it was made with another configuration; resume with the same options, or start anew in another folder"
+                    .into(),
+            ));
+        }
+        let then: String = file.metadata_value(&path, "selection")?;
+        if then != selection_of(&capture) {
+            return Err(fail(
+                "it was made with other images; resume with the same capture, --views and --lights".into(),
+            ));
+        }
+        let scene: Scene = toml::from_str(&file.metadata_value::<String>(&path, "scene")?)
+            .map_err(|e| fail(format!("metadata `scene`: {e}")))?;
+        let step: u64 = file.metadata_value(&path, "step")?;
+        let origin: String = file.metadata_value(&path, "initial_origin")?;
+        let mut run = Self::from_points(capture, config, scene, &InitialPoints { origin, ..Default::default() })?;
+        run.engine.restore(&path, file)?;
+        run.step = step;
+        Ok(run)
+    }
+
+    /// Whether `folder` holds a checkpoint.
+    pub fn has_checkpoint(folder: &Path) -> bool {
+        folder.join(STATE_FILE).is_file()
+    }
+
+    /// Writes a checkpoint into `folder`, replacing the one before only once the new one is whole on disk.
+    pub fn save_checkpoint(&mut self, folder: &Path) -> Result<PathBuf, ReconstructError> {
+        std::fs::create_dir_all(folder).map_err(|source| ReconstructError::Io {
+            path: folder.to_owned(),
+            action: "create the folder",
+            source,
+        })?;
+        let mut file = self.engine.state()?;
+        let scene = toml::to_string(&self.engine.model()?.scene)
+            .map_err(|e| ReconstructError::Config { origin: "scene".into(), detail: e.to_string() })?;
+        file.metadata.insert("scene".into(), scene);
+        file.metadata.insert("step".into(), self.step.to_string());
+        file.metadata.insert("config".into(), self.config.to_toml()?);
+        file.metadata.insert("selection".into(), selection_of(&self.capture));
+        file.metadata.insert("initial_origin".into(), self.initial_origin.clone());
+        let path = folder.join(STATE_FILE);
+        file.write(&path)?;
+        Ok(path)
+    }
+
+    /// Steps done so far.
+    pub fn steps_done(&self) -> u64 {
+        self.step
+    }
+
+    /// Whether all steps are done.
+    pub fn finished(&self) -> bool {
+        self.step >= self.config.steps
+    }
+
+    /// Whether a checkpoint is due now.
+    pub fn checkpoint_due(&self) -> bool {
+        self.step > 0 && self.step.is_multiple_of(self.config.checkpoint_steps)
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The capture.
+    pub fn capture(&self) -> &Capture {
+        &self.capture
+    }
+
+    /// The number of (view, light) pairs that it learns from.
+    pub fn pair_count(&self) -> usize {
+        self.pairs.len()
+    }
+
+    /// The model as it stands.
+    pub fn model(&mut self) -> Result<&Model, ReconstructError> {
+        self.engine.model()
+    }
+
+    /// Renders one camera under each light.
+    pub fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
+        self.engine.render(camera, lights)
+    }
+
+    /// Seconds spent in each part of the steps so far.
+    pub fn profile(&self) -> Vec<(&'static str, f64)> {
+        self.engine.profile()
+    }
+
+    /// One training step.
+    pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
+        let plan = StepPlan::new(&self.config, self.step);
+        let batch = self.config.accumulate as u64;
+        let mut loaded: Vec<(usize, usize, Arc<Observation>)> = Vec::with_capacity(batch as usize);
+        for k in 0..batch {
+            let (v, s) = self.pairs[self.order.at(self.step * batch + k)];
+            let shot = &self.capture.train[v].shots[s];
+            loaded.push((v, s, self.capture.observation(shot)?));
+        }
+        let pairs: Vec<TrainingPair<'_>> = loaded
+            .iter()
+            .map(|(v, s, observation)| {
+                let view = &self.capture.train[*v];
+                TrainingPair {
+                    camera: &view.camera,
+                    light: &view.shots[*s].light,
+                    radiance: &observation.radiance,
+                    mask: observation.mask.as_ref(),
+                    weight: view.shots[*s].weight,
+                }
+            })
+            .collect();
+        let report = self.engine.training_step(self.step, &plan, &pairs)?;
+        self.step += 1;
+        Ok(report)
+    }
+}
+
+/// The images that a run learns from, as text.
+fn selection_of(capture: &Capture) -> String {
+    let names: Vec<&str> = capture.train.iter().flat_map(|v| &v.shots).map(|s| s.name.as_str()).collect();
+    names.join(" ")
+}

@@ -1,0 +1,100 @@
+//! What changes with the step: learning rates, warm-ups, unfreezing, rounds of density control.
+use crate::Config;
+
+/// Everything that depends on the step number, for one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepPlan {
+    /// Learning rate of the means, × scene extent still to come.
+    pub mean_rate: f32,
+    /// Factor on the rates of all other Gaussian attributes.
+    pub attribute_factor: f32,
+    /// Learning rate of the networks.
+    pub network_rate: f32,
+    /// Added to learned incident light.
+    pub incident_offset: f32,
+    /// Whether roughness is still the constant 0.5.
+    pub roughness_frozen: bool,
+    /// Whether density statistics are collected.
+    pub collect_density: bool,
+    /// Whether a round of density control follows this step.
+    pub densify: bool,
+    /// Whether opacities are reset after this step.
+    pub reset_opacity: bool,
+}
+
+/// Geometric interpolation from `a` to `b`; linear where one of them is 0.
+fn log_lerp(a: f32, b: f32, t: f32) -> f32 {
+    let t = t.clamp(0.0, 1.0);
+    if a > 0.0 && b > 0.0 { (a.ln() * (1.0 - t) + b.ln() * t).exp() } else { a * (1.0 - t) + b * t }
+}
+
+impl StepPlan {
+    /// The plan of `step` (0-based) under `config`.
+    pub fn new(config: &Config, step: u64) -> Self {
+        let fraction = step as f32 / config.steps as f32;
+        let r = &config.rates;
+        let s = &config.shading;
+        let mean_progress = if r.mean_decay > 0.0 { fraction / r.mean_decay } else { 1.0 };
+        let incident_offset = if s.incident_warm_up == 0.0 || s.incident_warm_up_fraction <= 0.0 {
+            0.0
+        } else {
+            let x = fraction / s.incident_warm_up_fraction;
+            match x {
+                x if x < 1.0 => s.incident_warm_up * x,
+                x if x < 2.0 && !s.incident_warm_up_drop => s.incident_warm_up * (2.0 - x),
+                _ => 0.0,
+            }
+        };
+        let d = &config.density;
+        let at = |f: f32| (f as f64 * config.steps as f64).round() as u64;
+        let (from, until) = (at(d.from), at(d.until));
+        let done = step + 1;
+        let active = d.enabled && done <= until;
+        let reset = at(d.reset_every);
+        Self {
+            mean_rate: log_lerp(r.mean, r.mean_final, mean_progress),
+            attribute_factor: log_lerp(1.0, r.attribute_final, fraction),
+            network_rate: log_lerp(r.network, r.network_final, fraction),
+            incident_offset,
+            roughness_frozen: fraction < s.roughness_unfreeze,
+            collect_density: active,
+            densify: active && done > from && done.is_multiple_of(d.every_steps),
+            reset_opacity: active && reset > 0 && done.is_multiple_of(reset) && done < until,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_fall_and_rounds_end() {
+        let mut config = Config::preset("resolved").unwrap();
+        config.steps = 1000;
+        config.rates.mean_decay = 1.0;
+        let first = StepPlan::new(&config, 0);
+        let last = StepPlan::new(&config, 1000);
+        assert!((first.mean_rate - config.rates.mean).abs() < 1e-9);
+        assert!((last.mean_rate - config.rates.mean_final).abs() < 1e-9);
+        let rounds = (0..1000).filter(|&s| StepPlan::new(&config, s).densify).count() as u64;
+        let expected = (1..=1000u64)
+            .filter(|s| s % config.density.every_steps == 0)
+            .filter(|&s| s as f32 > config.density.from * 1000.0 && s as f32 <= config.density.until * 1000.0)
+            .count() as u64;
+        assert_eq!(rounds, expected);
+        assert!(StepPlan::new(&config, 10).roughness_frozen && !StepPlan::new(&config, 500).roughness_frozen);
+    }
+
+    #[test]
+    fn the_warm_up_ramps_down_or_drops() {
+        let mut config = Config::preset("resolved").unwrap();
+        config.steps = 100;
+        config.shading.incident_warm_up = 4.0;
+        config.shading.incident_warm_up_fraction = 0.1;
+        let offset = |c: &Config, s| StepPlan::new(c, s).incident_offset;
+        assert!((offset(&config, 5) - 2.0).abs() < 1e-5 && (offset(&config, 15) - 2.0).abs() < 1e-5);
+        config.shading.incident_warm_up_drop = true;
+        assert_eq!(offset(&config, 11), 0.0);
+    }
+}

@@ -1,0 +1,158 @@
+//! Named f32 tensors with text metadata in one safetensors file, written so that a crash never leaves half a file.
+use crate::ReconstructError;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::{BTreeMap, HashMap};
+use std::io::Write;
+use std::path::Path;
+
+/// Metadata key under which the SHA-256 of all tensor bytes is stored.
+const DIGEST_KEY: &str = "sha256";
+
+/// Named tensors and metadata.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TensorFile {
+    /// Shape and row-major values of each tensor.
+    pub tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
+    /// Text metadata.
+    pub metadata: BTreeMap<String, String>,
+}
+
+/// Writes `bytes` to `path` through a temporary file in the same folder: written, synced, renamed.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ReconstructError> {
+    let fail = |action| move |source| ReconstructError::Io { path: path.to_owned(), action, source };
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".tmp");
+    let temporary = path.with_file_name(name);
+    let mut file = std::fs::File::create(&temporary).map_err(fail("create a temporary file beside it"))?;
+    file.write_all(bytes).map_err(fail("write"))?;
+    file.sync_all().map_err(fail("sync"))?;
+    drop(file);
+    std::fs::rename(&temporary, path).map_err(fail("rename the temporary file onto it"))?;
+    if let Some(folder) = path.parent().and_then(|p| std::fs::File::open(p).ok()) {
+        // Makes the rename itself durable; not every file system can, and the file is whole either way.
+        let _ = folder.sync_all();
+    }
+    Ok(())
+}
+
+fn digest<'a>(tensors: impl Iterator<Item = (&'a String, &'a [u8])>) -> String {
+    use sha2::{Digest, Sha256};
+    let mut hash = Sha256::new();
+    for (name, bytes) in tensors {
+        hash.update(name.as_bytes());
+        hash.update((bytes.len() as u64).to_le_bytes());
+        hash.update(bytes);
+    }
+    hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
+}
+
+impl TensorFile {
+    /// Adds a tensor; `values.len()` must be the product of `shape`.
+    pub fn insert(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f32>) {
+        debug_assert_eq!(shape.iter().product::<usize>(), values.len());
+        self.tensors.insert(name.into(), (shape.to_vec(), values));
+    }
+
+    /// Writes the file atomically.
+    pub fn write(&self, path: &Path) -> Result<(), ReconstructError> {
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let bytes: BTreeMap<&String, Vec<u8>> = self
+            .tensors
+            .iter()
+            .map(|(name, (_, values))| (name, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
+            .collect();
+        let mut metadata: HashMap<String, String> =
+            self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
+        metadata.insert(DIGEST_KEY.into(), digest(bytes.iter().map(|(n, b)| (*n, b.as_slice()))));
+        let mut views = Vec::with_capacity(bytes.len());
+        for (name, data) in &bytes {
+            let shape = self.tensors[*name].0.clone();
+            views.push((*name, TensorView::new(Dtype::F32, shape, data).map_err(|e| fail(e.to_string()))?));
+        }
+        let out = safetensors::serialize(views, Some(metadata)).map_err(|e| fail(e.to_string()))?;
+        write_atomically(path, &out)
+    }
+
+    /// Reads and verifies a file that [`TensorFile::write`] wrote.
+    pub fn read(path: &Path) -> Result<Self, ReconstructError> {
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let bytes = std::fs::read(path).map_err(|source| ReconstructError::Io {
+            path: path.to_owned(),
+            action: "read",
+            source,
+        })?;
+        let broken = |e: safetensors::SafeTensorError| {
+            fail(format!("expected a safetensors file, found a broken one ({e}); use an older checkpoint or start anew"))
+        };
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(broken)?;
+        let parsed = SafeTensors::deserialize(&bytes).map_err(broken)?;
+        let mut metadata: BTreeMap<String, String> =
+            header.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
+        let expected = metadata.remove(DIGEST_KEY);
+        let mut views: Vec<(String, TensorView)> = parsed.tensors();
+        views.sort_by(|a, b| a.0.cmp(&b.0));
+        let found = digest(views.iter().map(|(n, v)| (n, v.data())));
+        if expected.as_deref() != Some(found.as_str()) {
+            return Err(fail("the checksum does not match its contents: the file was changed or damaged".into()));
+        }
+        let mut tensors = BTreeMap::new();
+        for (name, view) in views {
+            if view.dtype() != Dtype::F32 {
+                return Err(fail(format!("tensor {name}: expected f32, found {:?}", view.dtype())));
+            }
+            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            tensors.insert(name, (view.shape().to_vec(), values));
+        }
+        Ok(Self { tensors, metadata })
+    }
+
+    /// Takes out a tensor of the given number of values.
+    pub fn take(&mut self, path: &Path, name: &str, expected: usize) -> Result<Vec<f32>, ReconstructError> {
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let (shape, values) = self.tensors.remove(name).ok_or_else(|| fail(format!("tensor `{name}` is missing")))?;
+        if values.len() != expected {
+            return Err(fail(format!("tensor `{name}`: expected {expected} values, found shape {shape:?}")));
+        }
+        Ok(values)
+    }
+
+    /// A metadata value, parsed.
+    pub fn metadata_value<T: std::str::FromStr>(&self, path: &Path, key: &str) -> Result<T, ReconstructError> {
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let text = self.metadata.get(key).ok_or_else(|| fail(format!("metadata `{key}` is missing")))?;
+        text.parse().map_err(|_| fail(format!("metadata `{key}`: cannot read {text:?}")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder(name: &str) -> std::path::PathBuf {
+        let path = std::env::temp_dir().join(format!("diamond-tensor-{name}-{}", std::process::id()));
+        std::fs::create_dir_all(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn round_trip_and_damage() {
+        let dir = folder("round-trip");
+        let path = dir.join("a.safetensors");
+        let mut file = TensorFile::default();
+        file.insert("x", &[2, 2], vec![1.0, f32::MIN_POSITIVE, -0.0, 1e30]);
+        file.insert("empty", &[0, 3], vec![]);
+        file.metadata.insert("step".into(), "12".into());
+        file.write(&path).unwrap();
+        let again = TensorFile::read(&path).unwrap();
+        assert_eq!(file, again);
+        assert_eq!(again.metadata_value::<u64>(&path, "step").unwrap(), 12);
+
+        let mut bytes = std::fs::read(&path).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        assert!(TensorFile::read(&path).unwrap_err().to_string().contains("checksum"));
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        assert!(TensorFile::read(&path).unwrap_err().to_string().contains("broken"));
+        std::fs::remove_dir_all(dir).unwrap();
+    }
+}
