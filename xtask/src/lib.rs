@@ -2,4 +2,7 @@
 //!
 //! `cargo xtask oracle` and the cross-crate tests run the same code, so a table that passes in one passes in the other.
 
+pub mod fixtures;
 pub mod oracle;
+pub mod suite;
+pub mod tidy;

@@ -1,3 +1,122 @@
-//! `cargo xtask`: the workspace's own tools.
+//! `cargo xtask`: oracle checks, house rules, fixtures, and all tests.
 
-fn main() {}
+use clap::{Parser, Subcommand};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use xtask::oracle::{self, OracleKind};
+use xtask::{fixtures, suite, tidy};
+
+const EXAMPLES: &str = "\
+Examples:
+  cargo xtask test                                  everything that must pass before a commit
+  cargo xtask oracle ggx assets/fixtures/ggx        our microfacet terms against a table
+  cargo xtask oracle splat scenes/dense_1000.npz    one splat scene
+  cargo xtask tidy --rules                          the house rules and their reasons
+  cargo xtask fixtures --update                     accept the reference files as they are now
+
+Exit codes: 0 all is well, 1 a check failed, 2 wrong usage or unreadable input.";
+
+/// The workspace's own tools.
+#[derive(Parser)]
+#[command(name = "cargo xtask", bin_name = "cargo xtask", after_help = EXAMPLES)]
+struct Arguments {
+    #[command(subcommand)]
+    tool: Tool,
+}
+
+#[derive(Subcommand)]
+enum Tool {
+    /// Compare our implementation with reference values; prints the worst error of each column.
+    Oracle {
+        /// Which family of references.
+        kind: OracleKind,
+        /// A file or folder of the form of assets/fixtures/{ggx,splat,metrics}.
+        path: PathBuf,
+    },
+    /// Check the house rules: floors, outside crates, file heads, equation tags, and more.
+    Tidy {
+        /// Print the rules with their reasons instead.
+        #[arg(long)]
+        rules: bool,
+    },
+    /// Run every test of the workspace, then the house rules.
+    Test {
+        /// The long tests too.
+        #[arg(long)]
+        full: bool,
+    },
+    /// Compare reference files and captures with their manifest of hashes.
+    Fixtures {
+        /// Compare (the default).
+        #[arg(long, conflicts_with = "update")]
+        check: bool,
+        /// Rewrite the manifest from the files as they are.
+        #[arg(long)]
+        update: bool,
+    },
+}
+
+fn main() -> ExitCode {
+    match run(Arguments::parse().tool) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(message) => {
+            eprintln!("xtask: {message}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Whether what was checked is well.
+fn run(tool: Tool) -> Result<bool, String> {
+    let root = tidy::workspace_root();
+    match tool {
+        Tool::Oracle { kind, path } => {
+            let report = oracle::run(kind, &path)?;
+            println!("{report}");
+            Ok(report.passed())
+        }
+        Tool::Tidy { rules: true } => {
+            for rule in tidy::RULES {
+                println!("{:<16} {}", rule.name, rule.reason);
+            }
+            Ok(true)
+        }
+        Tool::Tidy { rules: false } => {
+            let findings = tidy::run(root)?;
+            findings.iter().for_each(|finding| println!("{finding}"));
+            let errors = findings.iter().filter(|finding| !finding.warning).count();
+            println!("tidy: {} rules, {errors} errors, {} hints", tidy::RULES.len(), findings.len() - errors);
+            Ok(errors == 0)
+        }
+        Tool::Test { full } => suite::run(root, full),
+        Tool::Fixtures { update: true, .. } => {
+            let count = fixtures::update(root)?;
+            println!("{}: {count} files", fixtures::MANIFEST);
+            Ok(true)
+        }
+        Tool::Fixtures { update: false, .. } => {
+            let (count, differences) = fixtures::check(root)?;
+            differences.iter().for_each(|difference| println!("{difference}"));
+            println!("{}: {count} files, {} differences", fixtures::MANIFEST, differences.len());
+            Ok(differences.is_empty())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_well_formed() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn a_missing_reference_is_an_error_and_not_a_pass() {
+        let tool = Tool::Oracle { kind: OracleKind::Ggx, path: "no/such/table.csv".into() };
+        assert!(run(tool).is_err());
+    }
+}

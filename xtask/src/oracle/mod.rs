@@ -12,7 +12,7 @@ use std::fmt;
 use std::path::Path;
 
 /// Which family of reference values a path holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum OracleKind {
     /// A CSV table of microfacet terms (distribution, masking, Fresnel, products).
     Ggx,
