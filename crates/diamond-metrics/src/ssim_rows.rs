@@ -79,34 +79,39 @@ fn weigh(rows: [&[f64]; TAPS], w: &[f64; RADIUS + 1], out: &mut [f64]) {
     }
 }
 
-/// The last eleven rows of `MAPS` maps, each blurred along x.
-struct Ring<const MAPS: usize> {
+/// The last eleven rows of up to four maps, each blurred along x.
+struct Ring {
     /// Blurred rows, slot `y % 11`, of each map.
-    slots: [Vec<f64>; MAPS],
+    slots: [Vec<f64>; 4],
     /// One unblurred row of each map between five pixels of zeros on either side.
-    padded: [Vec<f64>; MAPS],
+    padded: [Vec<f64>; 4],
     zero: Vec<f64>,
     /// Values per row, and values per pixel.
     n: usize,
     channels: usize,
+    /// Distance of two slots.
+    stride: usize,
 }
 
-impl<const MAPS: usize> Ring<MAPS> {
+impl Ring {
     fn new(n: usize, channels: usize) -> Self {
+        // Five cache lines past a multiple of 4096 bytes: rows at the same column never share a cache set.
+        let stride = n.div_ceil(512) * 512 + 40;
         Self {
-            slots: std::array::from_fn(|_| vec![0.0; TAPS * n]),
+            slots: std::array::from_fn(|_| vec![0.0; TAPS * stride]),
             padded: std::array::from_fn(|_| vec![0.0; n + 2 * RADIUS * channels]),
             zero: vec![0.0; n],
             n,
+            stride,
             channels,
         }
     }
 
-    /// Blurs row `y`, which lies in `padded`, along x into its slot.
+    /// Blurs row `y` of the first `maps` maps, which lies in `padded`, along x into its slot.
     #[inline(always)]
-    fn push(&mut self, y: usize, w: &[f64; RADIUS + 1]) {
-        let (n, at) = (self.n, (y % TAPS) * self.n);
-        for m in 0..MAPS {
+    fn push(&mut self, y: usize, w: &[f64; RADIUS + 1], maps: usize) {
+        let (n, at) = (self.n, (y % TAPS) * self.stride);
+        for m in 0..maps {
             let source = &self.padded[m];
             let shifted = std::array::from_fn(|k| &source[k * self.channels..k * self.channels + n]);
             weigh(shifted, w, &mut self.slots[m][at..at + n]);
@@ -117,7 +122,7 @@ impl<const MAPS: usize> Ring<MAPS> {
     #[inline(always)]
     fn blur(&self, m: usize, y: usize, height: usize, w: &[f64; RADIUS + 1], out: &mut [f64]) {
         let rows = std::array::from_fn(|k| match (y + k).checked_sub(RADIUS) {
-            Some(r) if r < height => &self.slots[m][(r % TAPS) * self.n..][..self.n],
+            Some(r) if r < height => &self.slots[m][(r % TAPS) * self.stride..][..self.n],
             _ => &self.zero[..],
         });
         weigh(rows, w, out);
@@ -157,6 +162,45 @@ fn compare_row<const GRADIENT: bool>(blurred: &mut [Vec<f64>; 4], value: &mut [f
     }
 }
 
+/// Order of the maps of partial derivatives; the last one only if the second image's gradient is wanted.
+const TO_A: usize = 0;
+const TO_SQUARE_S: usize = 1;
+const TO_SQUARE_D: usize = 2;
+const TO_B: usize = 3;
+
+/// Scales the derivatives `blurred` (toward mean s, mean d, s², d²) of one row by the cotangent `g` and sorts them.
+#[inline(always)]
+fn scale_row(g: Cotangent<'_>, blurred: &[Vec<f64>; 4], targets: [&mut [f64]; 4], span: std::ops::Range<usize>) {
+    let [mean_s, mean_d, square_s, square_d] = blurred.each_ref().map(|r| &r[span.clone()]);
+    let [to_a, to_square_s, to_square_d, to_b] = targets.map(|r| &mut r[span.clone()]);
+    let n = span.len();
+    let mut put = |i: usize, g: f64| {
+        to_a[i] = g * (mean_s[i] + mean_d[i]);
+        to_square_s[i] = g * square_s[i];
+        to_square_d[i] = g * square_d[i];
+        to_b[i] = g * (mean_s[i] - mean_d[i]);
+    };
+    match g {
+        Cotangent::Uniform(g) => (0..n).for_each(|i| put(i, g)),
+        Cotangent::Map(g) => {
+            let g = &g[span];
+            (0..n).for_each(|i| put(i, g[i] as f64));
+        }
+    }
+}
+
+/// One row of the gradient: what reaches the image through its mean, and through s² and d² (`sign` is ∂d/∂image).
+#[inline(always)]
+fn assemble_row(rows: (&[f32], &[f32]), mean: &[f64], squares: [&Vec<f64>; 2], sign: f64, out: &mut [f32]) {
+    let n = out.len();
+    let (a, b, mean) = (&rows.0[..n], &rows.1[..n], &mean[..n]);
+    let [square_s, square_d] = squares.map(|r| &r[..n]);
+    for i in 0..n {
+        let (x, y) = (a[i] as f64, b[i] as f64);
+        out[i] = (mean[i] + 2.0 * ((x + y) * square_s[i] + sign * (x - y) * square_d[i])) as f32;
+    }
+}
+
 /// SSIM of the rows `band` of `pair`: the whole pipeline. Each row depends on the images only, not on the band.
 #[inline(always)]
 fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows {
@@ -167,13 +211,17 @@ fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows
     let edge = RADIUS * channels..RADIUS * channels + n;
     let gradient = wanted.gradient.is_some();
 
-    let mut images = Ring::<4>::new(n, channels);
+    let mut images = Ring::new(n, channels);
     let mut blurred: [Vec<f64>; 4] = std::array::from_fn(|_| vec![0.0; n]);
     let mut value = vec![0.0; n];
     let mut out = Rows::default();
-    // Partials: toward a's mean, toward b's mean, toward s², toward d².
+    if gradient {
+        out.d_a = vec![0.0; band.len() * n];
+        out.d_b = vec![0.0; if wanted.both { band.len() * n } else { 0 }];
+    }
+    let maps = if wanted.both { 4 } else { 3 };
     let partial_width = if gradient { n } else { 0 };
-    let mut partials = Ring::<4>::new(partial_width, channels);
+    let mut partials = Ring::new(partial_width, channels);
     let mut spread: [Vec<f64>; 4] = std::array::from_fn(|_| vec![0.0; partial_width]);
 
     let halo = if gradient { RADIUS } else { 0 };
@@ -190,7 +238,7 @@ fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows
                 ss[i] = (x + y) * (x + y);
                 dd[i] = (x - y) * (x - y);
             }
-            images.push(t, &w);
+            images.push(t, &w, 4);
         }
         let Some(y) = t.checked_sub(RADIUS) else { continue };
         if compared.contains(&y) {
@@ -218,23 +266,17 @@ fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows
                 }
             }
             if let Some(cotangent) = wanted.gradient {
-                let [to_a, to_b, to_ss, to_dd] = partials.padded.each_mut().map(|r| &mut r[edge.clone()]);
-                for target in [&mut *to_a, &mut *to_b, &mut *to_ss, &mut *to_dd] {
-                    target.fill(0.0);
-                }
+                let targets = partials.padded.each_mut().map(|r| &mut r[edge.clone()]);
                 if counts {
-                    let mut put = |i: usize, g: f64| {
-                        to_a[i] = g * (blurred[0][i] + blurred[1][i]);
-                        to_b[i] = g * (blurred[0][i] - blurred[1][i]);
-                        to_ss[i] = g * blurred[2][i];
-                        to_dd[i] = g * blurred[3][i];
+                    let row = match cotangent {
+                        Cotangent::Uniform(_) => cotangent,
+                        Cotangent::Map(g) => Cotangent::Map(&g[y * n..(y + 1) * n]),
                     };
-                    match cotangent {
-                        Cotangent::Uniform(g) => interior.clone().for_each(|i| put(i, g)),
-                        Cotangent::Map(g) => interior.clone().for_each(|i| put(i, g[y * n + i] as f64)),
-                    }
+                    scale_row(row, &blurred, targets, interior.clone());
+                } else {
+                    targets.into_iter().for_each(|r| r.fill(0.0));
                 }
-                partials.push(y, &w);
+                partials.push(y, &w, maps);
             }
         }
         if !gradient {
@@ -242,19 +284,21 @@ fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows
         }
         let Some(y) = y.checked_sub(RADIUS) else { continue };
         if band.contains(&y) {
-            for m in 0..4 {
+            for m in 0..maps {
                 partials.blur(m, y, height, &w, &mut spread[m]);
             }
-            let (row_a, row_b) = (&a[y * n..(y + 1) * n], &b[y * n..(y + 1) * n]);
-            for i in 0..n {
-                let (s, d) = (row_a[i] as f64 + row_b[i] as f64, row_a[i] as f64 - row_b[i] as f64);
-                out.d_a.push((spread[0][i] + 2.0 * (s * spread[2][i] + d * spread[3][i])) as f32);
-            }
+            let rows = (&a[y * n..(y + 1) * n], &b[y * n..(y + 1) * n]);
+            let at = (y - band.start) * n;
+            assemble_row(
+                rows,
+                &spread[TO_A],
+                [&spread[TO_SQUARE_S], &spread[TO_SQUARE_D]],
+                1.0,
+                &mut out.d_a[at..at + n],
+            );
             if wanted.both {
-                for i in 0..n {
-                    let (s, d) = (row_a[i] as f64 + row_b[i] as f64, row_a[i] as f64 - row_b[i] as f64);
-                    out.d_b.push((spread[1][i] + 2.0 * (s * spread[2][i] - d * spread[3][i])) as f32);
-                }
+                let spread_d = [&spread[TO_SQUARE_S], &spread[TO_SQUARE_D]];
+                assemble_row(rows, &spread[TO_B], spread_d, -1.0, &mut out.d_b[at..at + n]);
             }
         }
     }
