@@ -1,14 +1,29 @@
 //! Anisotropic Gaussians and the N-channel tile rasteriser that blends them, forward and backward, on the CPU.
 //!
 //! Invariant: this crate knows nothing of materials, lights or images from disk: it blends feature channels.
+mod blend;
+mod bvh;
 mod config;
+pub mod density;
+mod ellipse;
 mod error;
 mod gaussians;
+mod lanes;
+mod neighbours;
 mod ply;
+mod projection;
+mod pullback;
+mod rasterize;
+mod tiles;
+mod visibility;
 
 pub use config::{Cutoff, RasterConfig};
 pub use error::SplatError;
 pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
+pub use neighbours::mean_squared_distance_to_nearest;
 pub use ply::{
     PlyColumn, PlyFormat, PlyTable, PointCloud, SH_DC, ScalarType, SplatPly, parse_ply, ply_bytes, read_ply, write_ply,
 };
+pub use projection::{Footprint, Projection, project};
+pub use rasterize::{Raster, RasterGrad, RasterPullback, RasterStats, rasterize, rasterize_projected};
+pub use visibility::{GaussianBvh, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};

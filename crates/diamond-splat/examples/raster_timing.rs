@@ -1,0 +1,107 @@
+//! How long the rasteriser takes, on the random scenes that its accuracy is tested with.
+//!
+//! `cargo run --release -p diamond-splat --example raster_timing [-- N W CHANNELS REPEATS]`
+//!
+//! Without arguments: "dense" (scales 0.002 to 0.02) and "thin" (0.0005 to 0.005) scenes of 10k and 100k Gaussians at
+//! 256² and 512² with 3 channels, and the sizes of a reconstruction step (10k and 50k, 128² and 256², 16 and 24
+//! channels). Prints the best and the median wall time in milliseconds, forward and forward + backward, and the pairs.
+use diamond_camera::{Camera, Intrinsics, Pose};
+use diamond_splat::{Features, Gaussians, RasterConfig, RasterGrad, rasterize};
+use glam::{Quat, Vec3};
+use std::time::Instant;
+
+/// SplitMix64 as numbers in [0, 1) with 24 bits.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 40) as f64 / (1u64 << 24) as f64
+    }
+}
+
+/// Means in a unit cube in front of the camera, log-uniform scales, uniform rotations, opacities in [0.02, 0.98].
+fn scene(n: usize, smallest: f64, largest: f64, channels: usize) -> (Gaussians, Features) {
+    let mut random = Random(42);
+    let mut gaussians = Gaussians::default();
+    let mut features = Features { channels, data: Vec::with_capacity(n * channels) };
+    for _ in 0..n {
+        let u: [f64; 13] = std::array::from_fn(|_| random.next());
+        let scale = |k: usize| (smallest.ln() + u[k] * (largest.ln() - smallest.ln())).exp() as f32;
+        let (a, b) = ((1.0 - u[6]).sqrt(), u[6].sqrt());
+        let (t1, t2) = (std::f64::consts::TAU * u[7], std::f64::consts::TAU * u[8]);
+        gaussians.push(
+            Vec3::new((u[0] - 0.5) as f32, (u[1] - 0.5) as f32, (u[2] + 0.5) as f32),
+            Vec3::new(scale(3), scale(4), scale(5)),
+            Quat::from_xyzw((a * t1.sin()) as f32, (a * t1.cos()) as f32, (b * t2.sin()) as f32, (b * t2.cos()) as f32),
+            (0.02 + 0.96 * u[9]) as f32,
+        );
+        features.data.extend((0..channels).map(|c| u[10 + c % 3] as f32));
+    }
+    (gaussians, features)
+}
+
+fn measure(name: &str, n: usize, side: u32, channels: usize, repeats: usize) {
+    let (smallest, largest) = if name == "dense" { (0.002, 0.02) } else { (0.0005, 0.005) };
+    let (gaussians, features) = scene(n, smallest, largest, channels);
+    let half = 0.5 * side as f32;
+    let intrinsics = Intrinsics { fx: side as f32, fy: side as f32, cx: half, cy: half, width: side, height: side };
+    let camera = Camera { intrinsics, pose: Pose::IDENTITY };
+    let config = RasterConfig { max_alpha: 0.999, near: 0.01, ..Default::default() };
+    let mut d = RasterGrad::zeros(side as usize, side as usize, channels);
+    for image in [&mut d.features, &mut d.opacity, &mut d.depth] {
+        image.data_mut().iter_mut().enumerate().for_each(|(i, v)| *v = (i % 7) as f32 - 3.0);
+    }
+    let (mut forward, mut both) = (Vec::new(), Vec::new());
+    let mut stats = Default::default();
+    for _ in 0..repeats {
+        let start = Instant::now();
+        let Ok((raster, pullback)) = rasterize(&gaussians, &features, &camera, &config) else { return };
+        forward.push(start.elapsed().as_secs_f64() * 1e3);
+        let Ok(pull) = pullback.pull(&d) else { return };
+        both.push(start.elapsed().as_secs_f64() * 1e3);
+        stats = raster.stats;
+        std::hint::black_box((raster, pull));
+    }
+    let best_and_median = |times: &mut Vec<f64>| {
+        times.sort_by(f64::total_cmp);
+        (times[0], times[times.len() / 2])
+    };
+    let (f, fb) = (best_and_median(&mut forward), best_and_median(&mut both));
+    println!(
+        "{name:5} {n:>6} {side:>4}² C={channels:<2} | forward {:7.2} ({:7.2}) | + backward {:7.2} ({:7.2}) ms | {:6.2} M evaluated, {:6.2} M blended, {:7} tile entries",
+        f.0,
+        f.1,
+        fb.0,
+        fb.1,
+        stats.evaluated_pairs as f64 * 1e-6,
+        stats.blended_pairs as f64 * 1e-6,
+        stats.tile_entries
+    );
+}
+
+fn main() {
+    let arguments: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
+    println!("threads: {}; best (median) wall time", rayon::current_num_threads());
+    if let [n, side, channels, repeats] = arguments[..] {
+        for name in ["dense", "thin"] {
+            measure(name, n, side as u32, channels, repeats);
+        }
+        return;
+    }
+    for name in ["dense", "thin"] {
+        for n in [10_000, 100_000] {
+            for side in [256, 512] {
+                measure(name, n, side, 3, 7);
+            }
+        }
+    }
+    for (n, side) in [(10_000, 128), (50_000, 128), (10_000, 256), (50_000, 256)] {
+        for channels in [16, 24] {
+            measure("dense", n, side, channels, 7);
+            measure("thin", n, side, channels, 7);
+        }
+    }
+}

@@ -1,0 +1,357 @@
+//! The rasteriser's front: `rasterize`, what it returns, and the pullback that belongs to it.
+use crate::blend::{GROUP, RowForward, RowWork, Scene};
+use crate::ellipse::{KAPPA2, TILE};
+use crate::lanes::{Thresholds, vector_width};
+use crate::projection::{FootprintGrad, View, finite_f32, is_smooth, project, project_pull};
+use crate::pullback::{Moments, RowBackward, RowGrad};
+use crate::tiles::{Rows, TileLists, assign_rows, tile_lists};
+use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
+use diamond_camera::Camera;
+use diamond_image::Image;
+use glam::{Vec2, Vec3, Vec4};
+use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// What a view of the Gaussians looks like. Weights are `w_k = α_k Π_{j<k} (1 − α_j)`, nearest first.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Raster {
+    /// Σ w f: as many channels as the features.
+    pub features: Image,
+    /// Σ w, in [0, 1): one channel.
+    pub opacity: Image,
+    /// Σ w z with view-space z, scene units, not divided by opacity: one channel.
+    pub depth: Image,
+    /// How much work it was.
+    pub stats: RasterStats,
+}
+
+/// How much work a picture was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RasterStats {
+    /// Gaussians that could contribute.
+    pub visible: usize,
+    /// (Gaussian, 8 × 8 tile) pairs.
+    pub tile_entries: u64,
+    /// (Gaussian, pixel) pairs whose alpha was evaluated.
+    pub evaluated_pairs: u64,
+    /// (Gaussian, pixel) pairs with a weight above 0.
+    pub blended_pairs: u64,
+}
+
+/// Cotangent of [`Raster`]: images of the same shapes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RasterGrad {
+    /// d loss / d features.
+    pub features: Image,
+    /// d loss / d opacity.
+    pub opacity: Image,
+    /// d loss / d depth.
+    pub depth: Image,
+}
+
+impl RasterGrad {
+    /// Zeros for a raster of this size.
+    pub fn zeros(width: usize, height: usize, channels: usize) -> Self {
+        Self {
+            features: Image::new(width, height, channels),
+            opacity: Image::new(width, height, 1),
+            depth: Image::new(width, height, 1),
+        }
+    }
+}
+
+/// The reverse of one [`rasterize`] call. It borrows the parameters, so that they cannot change before it is used.
+#[derive(Debug)]
+pub struct RasterPullback<'a> {
+    gaussians: &'a Gaussians,
+    projection: Cow<'a, Projection>,
+    channels: usize,
+    rows: Rows,
+    lists: Vec<TileLists>,
+    packed: Packed,
+}
+
+/// Features and depth by rank, padded.
+#[derive(Debug)]
+struct Packed {
+    stride: usize,
+    data: Vec<f32>,
+}
+
+/// Projects and blends `[eq:splat-blend]`.
+///
+/// Gaussians are blended in the order of their view-space z, ties by index. With `a = opacity · exp(−σ)`: alphas
+/// `a < min_alpha` are skipped, `α = min(a, max_alpha)`, and a pixel stops before the Gaussian that would bring its
+/// transmittance to `min_transmittance` or below. With [`Cutoff::Smooth`](crate::Cutoff::Smooth) alpha is multiplied by
+/// the smoothstep of `(a − min_alpha) / min_alpha` and pixels never stop.
+///
+/// Bits are the same for any number of threads (on one instruction set).
+///
+/// # Errors
+/// Whatever [`project`](crate::project()) refuses; features whose shape does not fit; visible features that are not finite.
+///
+/// ```
+/// use diamond_camera::{Camera, Intrinsics, Pose};
+/// use diamond_splat::{Features, Gaussians, RasterConfig, RasterGrad, rasterize};
+/// use glam::{Quat, Vec3};
+///
+/// let mut gaussians = Gaussians::default();
+/// gaussians.push(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.2), Quat::IDENTITY, 0.8);
+/// let features = Features { channels: 1, data: vec![0.5] };
+/// let camera = Camera { intrinsics: Intrinsics::from_fov_x(0.9, 32, 32), pose: Pose::IDENTITY };
+/// let (raster, pullback) = rasterize(&gaussians, &features, &camera, &RasterConfig::default())?;
+/// assert!((raster.opacity.pixel(16, 16)[0] - 0.8).abs() < 0.02);
+/// let mut d = RasterGrad::zeros(32, 32, 1);
+/// d.opacity.data_mut().fill(1.0);
+/// assert!(pullback.pull(&d)?.gaussians.opacities[0] > 0.0);
+/// # Ok::<(), diamond_splat::SplatError>(())
+/// ```
+pub fn rasterize<'a>(
+    gaussians: &'a Gaussians,
+    features: &Features,
+    camera: &Camera,
+    config: &RasterConfig,
+) -> Result<(Raster, RasterPullback<'a>), SplatError> {
+    let projection = project(gaussians, camera, config)?;
+    blend(Cow::Owned(projection), gaussians, features)
+}
+
+/// [`rasterize`] with a projection that was made before, for callers that compute features of
+/// [`visible`](Projection::visible) Gaussians only. `gaussians` must be the ones it was made from; feature rows of
+/// invisible Gaussians must exist and are never read.
+///
+/// # Errors
+/// As [`rasterize`].
+pub fn rasterize_projected<'a>(
+    projection: &'a Projection,
+    gaussians: &'a Gaussians,
+    features: &Features,
+) -> Result<(Raster, RasterPullback<'a>), SplatError> {
+    blend(Cow::Borrowed(projection), gaussians, features)
+}
+
+fn blend<'a>(
+    projection: Cow<'a, Projection>,
+    gaussians: &'a Gaussians,
+    features: &Features,
+) -> Result<(Raster, RasterPullback<'a>), SplatError> {
+    let n = gaussians.len();
+    if projection.radii().len() != n {
+        return Err(SplatError::Shape {
+            what: "Projection (of other Gaussians)",
+            expected: format!("{n} Gaussians"),
+            found: projection.radii().len().to_string(),
+        });
+    }
+    let channels = features.channels;
+    if features.data.len() != n * channels {
+        features.validate(n)?;
+    }
+    if let Some(&i) = projection.visible().iter().find(|&&i| !features.row(i as usize).iter().all(|v| v.is_finite())) {
+        return Err(SplatError::NonFinite { what: "Features::data (row of Gaussian)", index: i as usize });
+    }
+    let rows = assign_rows(&projection);
+    let packed = pack(&projection, &rows, features);
+    let k = &projection.camera.intrinsics;
+    let (width, height) = (k.width as usize, k.height as usize);
+    let mut raster = Raster {
+        features: Image::new(width, height, channels),
+        opacity: Image::new(width, height, 1),
+        depth: Image::new(width, height, 1),
+        stats: RasterStats { visible: rows.order.len(), ..Default::default() },
+    };
+    let scene = scene(&projection, &rows, &packed, channels);
+    let band = width * TILE;
+    // Zero channels: every row gets an empty piece.
+    let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
+        (0..height.div_ceil(TILE)).map(|_| Default::default()).collect()
+    } else {
+        raster.features.data_mut().chunks_mut(band * channels).collect()
+    };
+    let (lists, works): (Vec<TileLists>, Vec<RowWork>) = feature_rows
+        .par_iter_mut()
+        .zip(raster.opacity.data_mut().par_chunks_mut(band))
+        .zip(raster.depth.data_mut().par_chunks_mut(band))
+        .enumerate()
+        .map(|(row, ((features, opacity), depth))| {
+            let ranks = &rows.slot_rank[rows.row_start[row]..rows.row_start[row + 1]];
+            let mut lists = tile_lists(&rows.ellipses, ranks, row, width, height);
+            let forward = RowForward { scene: &scene, row, ranks, lists: &mut lists, features, opacity, depth };
+            let work = pulp::Arch::new().dispatch(forward);
+            (lists, work)
+        })
+        .unzip();
+    raster.stats.tile_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
+    raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
+    raster.stats.blended_pairs = works.iter().map(|w| w.blended).sum();
+    Ok((raster, RasterPullback { gaussians, projection, channels, rows, lists, packed }))
+}
+
+fn scene<'a>(projection: &Projection, rows: &'a Rows, packed: &'a Packed, channels: usize) -> Scene<'a> {
+    let config = &projection.config;
+    let smooth = is_smooth(config);
+    Scene {
+        ellipses: &rows.ellipses,
+        features: &packed.data,
+        stride: packed.stride,
+        channels,
+        limits: Thresholds {
+            min_alpha: config.min_alpha,
+            max_alpha: config.max_alpha,
+            min_transmittance: if smooth { -1.0 } else { config.min_transmittance },
+        },
+        smooth,
+        width: projection.camera.intrinsics.width as usize,
+        height: projection.camera.intrinsics.height as usize,
+    }
+}
+
+fn pack(projection: &Projection, rows: &Rows, features: &Features) -> Packed {
+    let channels = features.channels;
+    let stride = (channels + 1).next_multiple_of(vector_width().max(2 * GROUP));
+    let mut data = vec![0.0; rows.order.len() * stride];
+    data.par_chunks_mut(stride).with_min_len(1024).zip(&rows.order).for_each(|(to, &i)| {
+        let splat = &projection.splats[i as usize];
+        to[..channels].copy_from_slice(features.row(splat.gaussian as usize));
+        to[channels] = splat.depth;
+    });
+    Packed { stride, data }
+}
+
+impl RasterPullback<'_> {
+    /// The projection that was rendered.
+    pub fn projection(&self) -> &Projection {
+        &self.projection
+    }
+
+    /// Cotangents of the images to gradients of Gaussians and features; zero for what is not visible.
+    ///
+    /// # Errors
+    /// Images of the wrong shape, or with values that are not finite.
+    pub fn pull(&self, d: &RasterGrad) -> Result<RasterPull, SplatError> {
+        let k = &self.projection.camera.intrinsics;
+        let (width, height) = (k.width as usize, k.height as usize);
+        check(&d.features, (width, height, self.channels), "RasterGrad::features")?;
+        check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
+        check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
+        let scene = scene(&self.projection, &self.rows, &self.packed, self.channels);
+        let rows: Vec<RowGrad> = self
+            .lists
+            .par_iter()
+            .enumerate()
+            .map(|(row, lists)| {
+                let pixels = row * TILE * width..height.min((row + 1) * TILE) * width;
+                pulp::Arch::new().dispatch(RowBackward {
+                    scene: &scene,
+                    row,
+                    ranks: &self.rows.slot_rank[self.rows.row_start[row]..self.rows.row_start[row + 1]],
+                    lists,
+                    d_features: &d.features.data()[pixels.start * self.channels..pixels.end * self.channels],
+                    d_opacity: &d.opacity.data()[pixels.clone()],
+                    d_depth: &d.depth.data()[pixels],
+                })
+            })
+            .collect();
+        Ok(self.gather(&rows))
+    }
+
+    /// Sums the rows' contributions per Gaussian, in order of rows, and pulls them through the projection.
+    fn gather(&self, parts: &[RowGrad]) -> RasterPull {
+        let n = self.gaussians.len();
+        let (channels, stride) = (self.channels, self.packed.stride);
+        let mut rank_of = vec![u32::MAX; n];
+        for (rank, &i) in self.rows.order.iter().enumerate() {
+            rank_of[self.projection.splats[i as usize].gaussian as usize] = rank as u32;
+        }
+        let view = View::new(&self.projection.camera);
+        let mut pull = RasterPull {
+            gaussians: GaussiansGrad::zeros(n),
+            features: vec![0.0; n * channels],
+            screen: vec![Vec2::ZERO; n],
+        };
+        let g = &mut pull.gaussians;
+        let mut unused = vec![[0.0f32; 0]; if channels == 0 { n } else { 0 }];
+        let feature_rows: Vec<&mut [f32]> = if channels == 0 {
+            unused.iter_mut().map(|v| v.as_mut_slice()).collect()
+        } else {
+            pull.features.chunks_mut(channels).collect()
+        };
+        (g.means.par_iter_mut(), g.scales.par_iter_mut(), g.rotations.par_iter_mut(), g.opacities.par_iter_mut())
+            .into_par_iter()
+            .zip(feature_rows)
+            .zip(&mut pull.screen)
+            .enumerate()
+            .with_min_len(256)
+            .for_each(|(i, (((mean, scale, rotation, opacity), features), screen))| {
+                let rank = rank_of[i];
+                if rank == u32::MAX {
+                    return;
+                }
+                let one = self.gather_one(i, rank as usize, parts, stride, &view, features);
+                (*mean, *scale, *rotation, *opacity, *screen) = one;
+            });
+        pull
+    }
+
+    fn gather_one(
+        &self,
+        gaussian: usize,
+        rank: usize,
+        parts: &[RowGrad],
+        stride: usize,
+        view: &View,
+        features: &mut [f32],
+    ) -> (Vec3, Vec3, Vec4, f32, Vec2) {
+        let splat = &self.projection.splats[self.rows.order[rank] as usize];
+        let height = self.projection.camera.intrinsics.height;
+        let first_row = splat.pixel_rows(height).0 as usize / TILE;
+        let mut sum = Moments::default();
+        let mut d_depth = 0.0;
+        let slots = &self.rows.rank_slots[self.rows.rank_start[rank]..self.rows.rank_start[rank + 1]];
+        for (k, &slot) in slots.iter().enumerate() {
+            let row = first_row + k;
+            let slot = slot as usize - self.rows.row_start[row];
+            let part = &parts[row];
+            sum.add(&part.moments[slot]);
+            let line = &part.features[slot * stride..][..stride];
+            features.iter_mut().zip(line).for_each(|(a, b)| *a += b);
+            d_depth += line[self.channels] as f64;
+        }
+        let footprint = sum.footprint_grad(splat.chol, d_depth);
+        let d = project_pull(self.gaussians, gaussian, view, &footprint);
+        let d_opacity = finite_f32(sum.one / splat.opacity as f64);
+        let screen = Vec2::from_array(footprint.mean.map(finite_f32));
+        (d.mean, d.scale, d.rotation, d_opacity, screen)
+    }
+}
+
+impl Moments {
+    fn add(&mut self, o: &Moments) {
+        self.one += o.one;
+        (0..2).for_each(|k| self.first[k] += o.first[k]);
+        (0..3).for_each(|k| self.second[k] += o.second[k]);
+    }
+
+    /// Whitened moments to the cotangent of mean and covariance `[eq:splat-footprint-pull]`:
+    /// `d/d mean = L Σ g w`, `d/d Σ = ½ L (Σ g w wᵀ) Lᵀ` with `w = Lᵀd`.
+    fn footprint_grad(&self, [l11, l21, l22]: [f64; 3], d_depth: f64) -> FootprintGrad {
+        let (inv, half) = (1.0 / KAPPA2.sqrt(), 0.5 / KAPPA2);
+        let [u, v] = self.first.map(|m| m * inv);
+        let [uu, uv, vv] = self.second.map(|m| m * half);
+        FootprintGrad {
+            mean: [l11 * u, l21 * u + l22 * v],
+            cov: [l11 * l11 * uu, l11 * (l21 * uu + l22 * uv), l21 * l21 * uu + 2.0 * l21 * l22 * uv + l22 * l22 * vv],
+            depth: d_depth,
+        }
+    }
+}
+
+fn check(image: &Image, shape: (usize, usize, usize), what: &'static str) -> Result<(), SplatError> {
+    if image.shape() != shape {
+        return Err(SplatError::Shape { what, expected: format!("{shape:?}"), found: format!("{:?}", image.shape()) });
+    }
+    match image.data().iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(SplatError::NonFinite { what, index }),
+        None => Ok(()),
+    }
+}
