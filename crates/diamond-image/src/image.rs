@@ -1,4 +1,4 @@
-//! The image type: row-major interleaved `f32` values.
+//! The image type: row-major interleaved `f32` values, and what can be wrong with its shape.
 
 /// What can be wrong with the shape of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,23 +35,29 @@ pub struct Image {
     data: Vec<f32>,
 }
 
+/// Number of values of a shape; the largest `usize`, which no buffer reaches, where the product overflows.
+fn values(width: usize, height: usize, channels: usize) -> usize {
+    width.saturating_mul(height).saturating_mul(channels)
+}
+
 impl Image {
-    /// An image of zeros, `width` × `height` pixels of `channels` values.
+    /// An image of zeros, `width` × `height` pixels of `channels` values. Sizes from outside are to be checked before: this
+    /// panics like any allocation where memory does not suffice.
     pub fn new(width: usize, height: usize, channels: usize) -> Self {
-        Self { width, height, channels, data: vec![0.0; width * height * channels] }
+        Self::filled(width, height, channels, 0.0)
     }
 
-    /// An image whose every value is `value`.
+    /// An image whose every value is `value`. See [`Image::new`] about sizes.
     pub fn filled(width: usize, height: usize, channels: usize, value: f32) -> Self {
-        Self { width, height, channels, data: vec![value; width * height * channels] }
+        Self { width, height, channels, data: vec![value; values(width, height, channels)] }
     }
 
     /// Wraps `data` (row-major, interleaved, length `width·height·channels`).
     pub fn from_vec(width: usize, height: usize, channels: usize, data: Vec<f32>) -> Result<Self, ImageError> {
-        if data.len() != width * height * channels {
+        if data.len() != values(width, height, channels) {
             return Err(ImageError::Shape {
                 what: "Image::from_vec",
-                expected: format!("{width}×{height}×{channels} = {} values", width * height * channels),
+                expected: format!("{width}×{height}×{channels} = {} values", values(width, height, channels)),
                 found: format!("{} values", data.len()),
             });
         }
@@ -117,7 +123,7 @@ impl Image {
         Self { data: self.data.iter().map(|&v| f(v)).collect(), ..*self }
     }
 
-    /// Channels `range` as an image of their own.
+    /// Channels `range` as an image of their own. Panics where the range exceeds the channels, like slice indexing.
     pub fn channels_range(&self, range: std::ops::Range<usize>) -> Self {
         let channels = range.len();
         let mut data = Vec::with_capacity(self.pixels() * channels);
@@ -141,10 +147,55 @@ impl Image {
         Err(ImageError::Shape { what, expected: show(expected), found: show(self.shape()) })
     }
 
+    /// The mean of all values (summed in f64, in order); 0 for an image without values.
+    pub fn mean(&self) -> f32 {
+        if self.data.is_empty() {
+            return 0.0;
+        }
+        (self.data.iter().map(|&v| f64::from(v)).sum::<f64>() / self.data.len() as f64) as f32
+    }
+
     /// The position `(x, y, channel)` of the first value that is NaN or infinite.
     pub fn first_non_finite(&self) -> Option<(usize, usize, usize)> {
         let i = self.data.iter().position(|v| !v.is_finite())?;
         let (pixel, c) = (i / self.channels, i % self.channels);
         Some((pixel % self.width, pixel / self.width, c))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wrong_lengths_are_refused_and_named() {
+        let error = Image::from_vec(2, 2, 3, vec![0.0; 11]).unwrap_err().to_string();
+        assert!(error.contains("2×2×3 = 12 values") && error.contains("11 values"), "{error}");
+        assert!(Image::from_vec(usize::MAX, 2, 1, vec![]).is_err());
+        assert!(Image::from_vec(1 << 40, 1 << 40, 3, vec![0.0; 3]).is_err());
+        let error = Image::new(2, 3, 1).expect_shape((3, 2, 1), "reference").unwrap_err().to_string();
+        assert!(error.contains("reference: expected 3×2×1, found 2×3×1"), "{error}");
+        assert!(Image::new(2, 3, 1).expect_same_shape(&Image::new(2, 3, 1), "same").is_ok());
+    }
+
+    #[test]
+    fn the_first_value_that_is_not_finite_is_found() {
+        let mut image = Image::new(3, 2, 2);
+        assert_eq!(image.first_non_finite(), None);
+        image.pixel_mut(2, 1)[1] = f32::NAN;
+        assert_eq!(image.first_non_finite(), Some((2, 1, 1)));
+        image.pixel_mut(1, 0)[0] = f32::INFINITY;
+        assert_eq!(image.first_non_finite(), Some((1, 0, 0)));
+    }
+
+    #[test]
+    fn values_are_interleaved_row_by_row() {
+        let image = Image::from_vec(2, 2, 2, (0..8).map(|v| v as f32).collect()).unwrap();
+        assert_eq!(image.pixel(1, 0), [2.0, 3.0]);
+        assert_eq!(image.pixel(0, 1), [4.0, 5.0]);
+        assert_eq!(image.channels_range(1..2).data(), [1.0, 3.0, 5.0, 7.0]);
+        assert_eq!(image.map(|v| 2.0 * v).into_vec()[7], 14.0);
+        assert_eq!(image.mean(), 3.5);
+        assert_eq!(Image::new(0, 3, 3).mean(), 0.0);
     }
 }

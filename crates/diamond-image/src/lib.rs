@@ -1,9 +1,10 @@
-//! Row-major `f32` images and masks, bilinear sampling with its pullback, and colour transfer.
+//! Row-major `f32` images and masks, bilinear sampling with its pullback, colour transfer, area resizing, luminance.
 //!
 //! Invariant: nothing here knows of files, cameras or lights, and nothing outside the standard library is used.
 //!
 //! Pixel centres lie at `+0.5`: the pixel in column `x`, row `y` covers `[x, x+1) × [y, y+1)`; row 0 is at the top.
-//! Values are interleaved: element `(x, y, c)` lies at `(y·width + x)·channels + c`.
+//! Values are interleaved: element `(x, y, c)` lies at `(y·width + x)·channels + c`. Colour is linear radiance unless a
+//! [`Transfer`] says otherwise; where there is alpha, colour is premultiplied by it.
 //!
 //! ```
 //! use diamond_image::Image;
@@ -13,9 +14,12 @@
 //! ```
 mod bilinear;
 mod image;
+mod luminance;
 mod mask;
+mod resize;
 mod transfer;
 
 pub use image::{Image, ImageError};
+pub use luminance::{REC709_LUMINANCE, luminance, luminance_pull};
 pub use mask::Mask;
 pub use transfer::Transfer;
