@@ -223,7 +223,7 @@ fn bad_values_are_refused_with_line_or_byte() {
     complains(text(&format!("{head}one 2\n4 5\n")), Some(7), &["float", "`one`"]);
     complains(text(&format!("{head}1 2\n\n\nnan 5\n")), Some(10), &["vertex 1", "not finite"]);
     complains(text(&format!("{head}1e39 2\n4 5\n")), Some(7), &["not finite"]);
-    complains(text(&format!("{head}1 2\n        \n   ")), Some(9), &["ends before `vertex` 1 of 2"]);
+    complains(text(&format!("{head}1 2\n        \n   ")), Some(10), &["ends before `vertex` 1 of 2"]);
     complains(parse_ply(&[head.as_bytes(), b"1 \xff\xff\n1 2\n"].concat()), Some(7), &["no text"]);
     let mut bytes = ply_bytes(&one_column(ScalarType::F32, vec![1.0, 2.0]), PlyFormat::BinaryBigEndian).unwrap();
     let at = bytes.len() - 4;
@@ -432,7 +432,7 @@ fn point_clouds_are_read_with_colours_of_any_type() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(128))]
+    #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn tables_survive_every_format(table in table()) {

@@ -3,10 +3,15 @@
 //! Invariant: depends on no crate of ours, so an oracle can never share a mistake with what it judges.
 pub mod adjoint;
 pub mod camera;
+pub mod deferred;
 pub mod ggx;
 pub mod image;
 pub mod light;
+pub mod metrics;
+pub mod mlp;
+pub mod pseudo_normal;
 mod real;
 pub mod strategies;
+pub mod visibility;
 
 pub use real::{Dual, Real, gradient, jvp, vjp};

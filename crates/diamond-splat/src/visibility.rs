@@ -1,0 +1,314 @@
+//! Ray-traced visibility: how much of a light reaches each Gaussian through all the others.
+//!
+//! Along a ray the density of a Gaussian is a Gaussian itself, with one peak. Each Gaussian whose peak lies between
+//! the two ends of the ray takes away its opacity there, once: T = Π(1 − α). This is what the rasteriser
+//! does to a pixel, for an arbitrary ray and regardless of order, so that a light sees a scene as a camera in its
+//! place would.
+//!
+//! # Where the ray begins
+//!
+//! A surface is a shell of flat Gaussians that overlap. A receiver sits in the middle of this shell, among neighbours
+//! that are the same surface; if they were allowed to shade it everything would be black. What is wanted
+//! is the light that arrives *at* the shell, so the ray begins at its outer skin: at the mean, moved outward along the
+//! normal by [`VisibilityConfig::normal_offset`] standard deviations of the receiver's own extent along that normal.
+//! For flat Gaussians this is a hair's breadth. Without normals the ray begins at the mean, and its first
+//! [`VisibilityConfig::light_offset`] standard deviations toward the light are free.
+use crate::bvh::{Aabb, Bvh};
+use crate::density::unit_rotation;
+use crate::{Gaussians, SplatError};
+use diamond_light::OlatLight;
+use glam::{Mat3, Vec3};
+use rayon::prelude::*;
+
+/// Largest opacity of one occluder, as in the rasteriser.
+pub const MAX_OCCLUDER_ALPHA: f32 = 0.99;
+/// Opacity at which an occluder ends, as in the rasteriser.
+pub const MIN_OCCLUDER_ALPHA: f32 = 1.0 / 255.0;
+/// Below this transmittance a ray is abandoned.
+const MIN_TRANSMITTANCE: f32 = 1e-4;
+/// A Gaussian is at least this thick relative to its largest scale: a disc without thickness has no inverse.
+const MIN_FLATNESS: f32 = 1e-6;
+/// A Gaussian is at least this large (scene units), so that its inverse scale squared stays finite.
+const MIN_SCALE: f32 = 1e-12;
+/// Boxes are widened by this fraction of their size and position against rounding of the ray–box test.
+const BOX_MARGIN: f32 = 1e-5;
+
+/// How rays toward a light begin.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VisibilityConfig {
+    /// Where there is a normal: the ray begins this many of the receiver's own standard deviations along it.
+    pub normal_offset: f32,
+    /// Where there is none: occluders count from this many of the receiver's own standard deviations toward the light.
+    pub light_offset: f32,
+}
+
+impl Default for VisibilityConfig {
+    fn default() -> Self {
+        Self { normal_offset: 3.0, light_offset: 3.0 }
+    }
+}
+
+/// A Gaussian as rays need it.
+#[derive(Debug, Clone, Copy)]
+#[repr(C, align(64))]
+struct Occluder {
+    /// World → units of the Gaussian's standard deviations, three columns.
+    to_local: Mat3,
+    mean: Vec3,
+    opacity: f32,
+    /// Squared distance in standard deviations at which opacity falls to [`MIN_OCCLUDER_ALPHA`]; negative if nowhere.
+    max_q: f32,
+    /// Index of the Gaussian.
+    index: u32,
+}
+
+impl Occluder {
+    fn new(gaussians: &Gaussians, i: usize) -> Self {
+        let (mean, scale, rotation) = (gaussians.means[i], gaussians.scales[i], gaussians.rotations[i]);
+        let opacity = gaussians.opacities[i];
+        let valid = mean.is_finite() && scale.is_finite() && rotation.is_finite() && opacity >= MIN_OCCLUDER_ALPHA;
+        if !valid {
+            return Self { to_local: Mat3::ZERO, mean: Vec3::ZERO, opacity: 0.0, max_q: -1.0, index: i as u32 };
+        }
+        let inverse = thickened(scale).recip();
+        let rotation = Mat3::from_quat(unit_rotation(rotation));
+        Self {
+            to_local: Mat3::from_diagonal(inverse) * rotation.transpose(),
+            mean,
+            opacity,
+            max_q: 2.0 * (opacity / MIN_OCCLUDER_ALPHA).ln(),
+            index: i as u32,
+        }
+    }
+}
+
+fn thickened(scale: Vec3) -> Vec3 {
+    scale.abs().max(Vec3::splat((scale.abs().max_element() * MIN_FLATNESS).max(MIN_SCALE)))
+}
+
+/// `[eq:gaussian-bounds]` The box of the ellipsoid on which opacity·exp(−q/2) = 1/255: half sides √(q_max·Σ_ii) with
+/// q_max = 2·ln(255·opacity). Empty where the opacity is below 1/255.
+fn bounds(gaussians: &Gaussians, i: usize) -> Aabb {
+    let occluder = Occluder::new(gaussians, i);
+    if occluder.max_q < 0.0 {
+        return Aabb::EMPTY;
+    }
+    let axes =
+        Mat3::from_quat(unit_rotation(gaussians.rotations[i])) * Mat3::from_diagonal(thickened(gaussians.scales[i]));
+    // Row lengths, in two steps so that large scales do not overflow.
+    let variance = |row: Vec3| {
+        let largest = row.abs().max_element().max(f32::MIN_POSITIVE);
+        largest * (row / largest).length()
+    };
+    let deviation = Vec3::new(variance(axes.row(0)), variance(axes.row(1)), variance(axes.row(2)));
+    let half = deviation * occluder.max_q.sqrt();
+    let half = (half + BOX_MARGIN * (half + occluder.mean.abs())).min(Vec3::splat(0.25 * f32::MAX));
+    Aabb { min: (occluder.mean - half).into(), max: (occluder.mean + half).into() }
+}
+
+/// Gaussians in a bounding volume hierarchy, for rays.
+#[derive(Debug, Clone)]
+pub struct GaussianBvh {
+    bvh: Bvh,
+    /// In the order of the tree's leaves.
+    occluders: Vec<Occluder>,
+}
+
+impl GaussianBvh {
+    /// Builds the hierarchy. Errors only where the arrays differ in length; Gaussians that are not finite never
+    /// occlude.
+    pub fn build(gaussians: &Gaussians) -> Result<Self, SplatError> {
+        check_lengths(gaussians)?;
+        let boxes = boxes(gaussians);
+        let bvh = Bvh::build(&boxes, |i| {
+            let mean = gaussians.means[i];
+            if mean.is_finite() { mean } else { Vec3::ZERO }
+        });
+        let occluders = bvh.order().iter().map(|&i| Occluder::new(gaussians, i as usize)).collect();
+        Ok(Self { bvh, occluders })
+    }
+
+    /// Adopts changed parameters of the same Gaussians, about ten times faster than building. The tree grows worse
+    /// as the Gaussians move from where they were at building; results are the same.
+    pub fn refit(&mut self, gaussians: &Gaussians) -> Result<(), SplatError> {
+        check_lengths(gaussians)?;
+        self.check_count(gaussians.len())?;
+        self.bvh.refit(&boxes(gaussians));
+        self.occluders.par_iter_mut().with_min_len(1024).for_each(|o| *o = Occluder::new(gaussians, o.index as usize));
+        Ok(())
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.occluders.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.occluders.is_empty()
+    }
+
+    /// The share of light, in [0, 1], that passes from `origin + t_min·direction` to `origin + t_max·direction`.
+    /// `direction` need not be of unit length; t is in units of it, `t_max` may be infinite.
+    ///
+    /// `[eq:ray-transmittance]` T = Π(1 − α_k) over the Gaussians whose peak along the ray,
+    /// t_k = −(M(o−μ)·Md)/|Md|² with M = S⁻¹Rᵀ, lies in (t_min, t_max);
+    /// q_k = |M(o + t_k·d − μ)|², a_k = min(0.99, opacity·exp(−q_k/2)),
+    /// α_k = a_k·clamp(255·a_k − 1, 0, 1): nothing below 1/255 as in the rasteriser, but reached without a jump.
+    ///
+    /// A direction of zero, and anything that is not finite, gives 1. Once T < 1e-4 the rest is not looked at.
+    pub fn transmittance(&self, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> f32 {
+        self.transmittance_without(u32::MAX, origin, direction, t_min, t_max)
+    }
+
+    fn transmittance_without(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> f32 {
+        let valid = origin.is_finite() && direction.is_finite() && direction != Vec3::ZERO && t_min < t_max;
+        if !valid {
+            return 1.0;
+        }
+        let mut transmittance = 1.0f32;
+        self.bvh.visit(origin, direction, t_min, t_max, |places| {
+            for o in &self.occluders[places] {
+                let start = o.to_local * (origin - o.mean);
+                let step = o.to_local * direction;
+                let t = -start.dot(step) / step.length_squared();
+                let q = (start + step * t).length_squared();
+                // Comparisons are false for NaN, which thus never occludes.
+                if t > t_min && t < t_max && q < o.max_q && o.index != skip {
+                    transmittance *= 1.0 - occluder_alpha(o.opacity, q);
+                }
+            }
+            transmittance >= MIN_TRANSMITTANCE
+        });
+        transmittance
+    }
+
+    /// Visibility in [0, 1] of the light from each Gaussian: see the head of this file for where rays begin.
+    ///
+    /// `gaussians` are those that this hierarchy was built or refitted with. `normals`, if any, are one per Gaussian,
+    /// outward; those of zero length count as absent. The receiver never shades itself, and
+    /// nothing beyond a point light shades anything.
+    pub fn visibility_to_light(
+        &self,
+        gaussians: &Gaussians,
+        normals: Option<&[Vec3]>,
+        light: &OlatLight,
+        config: &VisibilityConfig,
+    ) -> Result<Vec<f32>, SplatError> {
+        self.check_receivers(gaussians, normals)?;
+        // Neighbours in the tree take similar paths through it, so receivers go in the tree's order.
+        let in_order: Vec<f32> = self
+            .occluders
+            .par_iter()
+            .with_min_len(64)
+            .map(|o| self.visibility(gaussians, normals, light, config, o.index as usize))
+            .collect();
+        let mut visibility = vec![1.0; in_order.len()];
+        for (o, v) in self.occluders.iter().zip(in_order) {
+            visibility[o.index as usize] = v;
+        }
+        Ok(visibility)
+    }
+
+    /// [`GaussianBvh::visibility_to_light`] for the Gaussians `indices` only, in their order.
+    pub fn visibility_subset(
+        &self,
+        gaussians: &Gaussians,
+        normals: Option<&[Vec3]>,
+        light: &OlatLight,
+        config: &VisibilityConfig,
+        indices: &[u32],
+    ) -> Result<Vec<f32>, SplatError> {
+        self.check_receivers(gaussians, normals)?;
+        if let Some(bad) = indices.iter().find(|&&i| i as usize >= self.len()) {
+            return Err(SplatError::Shape {
+                what: "visibility_subset, indices",
+                expected: format!("indices below {}", self.len()),
+                found: bad.to_string(),
+            });
+        }
+        Ok(indices
+            .par_iter()
+            .with_min_len(64)
+            .map(|&i| self.visibility(gaussians, normals, light, config, i as usize))
+            .collect())
+    }
+
+    fn visibility(
+        &self,
+        gaussians: &Gaussians,
+        normals: Option<&[Vec3]>,
+        light: &OlatLight,
+        config: &VisibilityConfig,
+        i: usize,
+    ) -> f32 {
+        let mean = gaussians.means[i];
+        let (scale, rotation) = (gaussians.scales[i], unit_rotation(gaussians.rotations[i]));
+        // Standard deviation along a unit direction: |S·Rᵀ·d|.
+        let deviation = |direction: Vec3| (scale * (rotation.conjugate() * direction)).length();
+        let normal = normals.and_then(|normals| normals[i].try_normalize());
+        let origin = match normal {
+            Some(normal) => mean + normal * (config.normal_offset * deviation(normal)),
+            None => mean,
+        };
+        let (direction, distance) = match *light {
+            OlatLight::Point { position, .. } => {
+                let to_light = position - origin;
+                match to_light.try_normalize() {
+                    Some(direction) => (direction, to_light.length()),
+                    None => return 1.0,
+                }
+            }
+            OlatLight::Directional { direction, .. } => (direction, f32::INFINITY),
+        };
+        let begin = if normal.is_some() { 0.0 } else { config.light_offset * deviation(direction) };
+        self.transmittance_without(i as u32, origin, direction, begin, distance)
+    }
+
+    fn check_count(&self, found: usize) -> Result<(), SplatError> {
+        if found == self.len() {
+            return Ok(());
+        }
+        let expected =
+            format!("{} (as when the hierarchy was built; build it again after density control)", self.len());
+        Err(SplatError::Shape { what: "GaussianBvh", expected, found: found.to_string() })
+    }
+
+    fn check_receivers(&self, gaussians: &Gaussians, normals: Option<&[Vec3]>) -> Result<(), SplatError> {
+        check_lengths(gaussians)?;
+        self.check_count(gaussians.len())?;
+        match normals {
+            Some(normals) if normals.len() != self.len() => Err(SplatError::Shape {
+                what: "GaussianBvh, normals",
+                expected: format!("{} (one per Gaussian)", self.len()),
+                found: normals.len().to_string(),
+            }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// What one occluder takes away, with the fade of [eq:ray-transmittance].
+#[inline]
+fn occluder_alpha(opacity: f32, q: f32) -> f32 {
+    let alpha = (opacity * (-0.5 * q).exp()).min(MAX_OCCLUDER_ALPHA);
+    alpha * (alpha / MIN_OCCLUDER_ALPHA - 1.0).clamp(0.0, 1.0)
+}
+
+fn boxes(gaussians: &Gaussians) -> Vec<Aabb> {
+    (0..gaussians.len()).into_par_iter().with_min_len(1024).map(|i| bounds(gaussians, i)).collect()
+}
+
+fn check_lengths(gaussians: &Gaussians) -> Result<(), SplatError> {
+    let n = gaussians.len();
+    for (what, found) in [
+        ("Gaussians::scales", gaussians.scales.len()),
+        ("Gaussians::rotations", gaussians.rotations.len()),
+        ("Gaussians::opacities", gaussians.opacities.len()),
+    ] {
+        if found != n {
+            return Err(SplatError::Shape { what, expected: format!("{n} (one per mean)"), found: found.to_string() });
+        }
+    }
+    Ok(())
+}
