@@ -27,6 +27,7 @@ impl CameraRig {
     /// `count` cameras at `distance` (scene units, > 0) from `target`, on the side of `up` (any length but 0), at
     /// elevations of at least `min_elevation` (radians, −π/2 … π/2), spread evenly in solid angle by the golden angle,
     /// the first nearest the zenith. All look at `target` with `up` upward.
+    /// `[eq:golden-dome]`
     pub fn dome(
         count: usize,
         intrinsics: Intrinsics,
@@ -107,6 +108,7 @@ mod tests {
         Intrinsics::from_fov_x(0.6, 64, 48)
     }
 
+    /// [eq:golden-dome]: evenness, elevation, aim.
     #[test]
     fn every_camera_of_a_dome_sees_the_target_in_the_middle_and_up_upward() {
         let rig = CameraRig::dome(100, intrinsics(), TARGET, Vec3::Y * 3.0, 2.0, 0.2).unwrap();

@@ -25,6 +25,7 @@ impl LightRig {
     /// `count` point lights on a dome: at `distance` (scene units, > 0) from `target`, on the side of `up` (need not have
     /// unit length), at elevations of at least `min_elevation` (radians, −π/2 … π/2; 0 is a hemisphere, −π/2 the whole
     /// sphere). They are spread evenly in solid angle by the golden angle, the first nearest the zenith.
+    /// `[eq:golden-dome]`
     pub fn dome(
         count: usize,
         target: Vec3,
@@ -114,6 +115,7 @@ fn dome_directions(count: usize, up: Vec3, min_elevation: f32) -> Result<Vec<Vec
 mod tests {
     use super::*;
 
+    /// [eq:golden-dome]: evenness, spacing, elevation.
     #[test]
     fn a_dome_is_even_and_above_its_elevation() {
         let elevation = 0.3f32;

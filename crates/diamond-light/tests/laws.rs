@@ -65,7 +65,7 @@ fn rotate(r: &[[f64; 3]; 3], v: Vec3) -> Vec3 {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(256))]
 
-    /// [eq:sh-addition]: Σₘ Y(l,m)(a)·Y(l,m)(b) = (2l + 1)/4π · P_l(a·b).
+    /// [eq:sh-basis], addition theorem: Σₘ Y(l,m)(a)·Y(l,m)(b) = (2l + 1)/4π · P_l(a·b).
     #[test]
     fn addition_theorem(a in unit_vector(), b in unit_vector()) {
         let (a, b) = (Vec3::from(a), Vec3::from(b));
@@ -89,7 +89,7 @@ proptest! {
         }
     }
 
-    /// [eq:sh-parity]: Y(l,m)(−ω) = (−1)^l·Y(l,m)(ω), to the bit.
+    /// [eq:sh-basis], parity: Y(l,m)(−ω) = (−1)^l·Y(l,m)(ω), to the bit.
     #[test]
     fn parity(d in unit_vector()) {
         let (plus, minus) = (basis(d.into()), basis(-Vec3::from(d)));
@@ -99,7 +99,7 @@ proptest! {
         }
     }
 
-    /// [eq:light-far-limit]: a point light moved to infinity with the reference distance is a directional light; the
+    /// [eq:light-incidence]: a point light moved to infinity with the reference distance is a directional light; the
     /// gap falls as the distance grows.
     #[test]
     fn far_point_lights_are_directional(to_light in unit_vector(), at in vector(-1.0..1.0), rgb in colour()) {
@@ -140,7 +140,7 @@ proptest! {
         prop_assert!((turned.irradiance.x / plain.irradiance.x - 1.0).abs() < 3e-5);
     }
 
-    /// A dome of point lights seen from its target is the directional dome.
+    /// [eq:golden-dome]: a dome of point lights seen from its target is the directional dome.
     #[test]
     fn domes_agree(up in unit_vector(), count in 1usize..40, elevation in finite(-1.5..1.5), distance in finite(0.5..9.0)) {
         let up = Vec3::from(up);
