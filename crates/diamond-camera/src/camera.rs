@@ -120,7 +120,7 @@ impl Camera {
 
     /// The view-space z of a depth at a pixel; the inverse of [`Camera::to_distance`].
     /// `[eq:depth-kinds]`
-    pub fn to_z(&self, pixel: Vec2, depth: Depth) -> f32 {
+    pub fn to_z(self, pixel: Vec2, depth: Depth) -> f32 {
         match depth {
             Depth::Z(z) => z,
             Depth::Distance(distance) => distance / self.pixel_direction(pixel).length(),
@@ -129,7 +129,7 @@ impl Camera {
 
     /// The Euclidean distance from the camera centre of a depth at a pixel.
     /// `[eq:depth-kinds]`
-    pub fn to_distance(&self, pixel: Vec2, depth: Depth) -> f32 {
+    pub fn to_distance(self, pixel: Vec2, depth: Depth) -> f32 {
         match depth {
             Depth::Z(z) => z * self.pixel_direction(pixel).length(),
             Depth::Distance(distance) => distance,

@@ -130,7 +130,7 @@ impl Pose {
     }
 
     /// The inverse of [`Pose::from_opengl_camera_to_world`].
-    pub fn to_opengl_camera_to_world(&self) -> Mat4 {
+    pub fn to_opengl_camera_to_world(self) -> Mat4 {
         let r = self.rotation.transpose();
         let c = self.centre();
         Mat4::from_cols(r.x_axis.extend(0.0), (-r.y_axis).extend(0.0), (-r.z_axis).extend(0.0), c.extend(1.0))
