@@ -27,7 +27,7 @@ impl std::fmt::Display for ShadingError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             ShadingError::Shape { what, expected, found } => {
-                write!(f, "{what}: expected {expected}, found {found}; pass arrays that describe the same rows")
+                write!(f, "{what}: expected {expected}, found {found}; pass arrays or images that describe the same rows or pixels")
             }
             ShadingError::Setting { what, expected, found } => {
                 write!(f, "{what}: expected {expected}, found {found}; change the setting")
@@ -45,4 +45,17 @@ pub(crate) fn check_length(what: &'static str, expected: usize, found: usize) ->
     } else {
         Err(ShadingError::Shape { what, expected: format!("{expected} values"), found: format!("{found} values") })
     }
+}
+
+/// `Ok` if `image` has the shape `(width, height, channels)`, else [`ShadingError::Shape`].
+pub(crate) fn check_image(
+    what: &'static str,
+    image: &diamond_image::Image,
+    expected: (usize, usize, usize),
+) -> Result<(), ShadingError> {
+    if image.shape() == expected {
+        return Ok(());
+    }
+    let show = |(w, h, c): (usize, usize, usize)| format!("{w}×{h} pixels of {c} channels");
+    Err(ShadingError::Shape { what, expected: show(expected), found: show(image.shape()) })
 }

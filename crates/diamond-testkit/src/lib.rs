@@ -7,6 +7,7 @@ pub mod deferred;
 pub mod ggx;
 pub mod image;
 pub mod light;
+pub mod losses;
 pub mod metrics;
 pub mod mlp;
 pub mod pseudo_normal;
