@@ -195,7 +195,7 @@ impl Capture {
         }
         if train.is_empty() {
             return Err(DatasetError::Field {
-                place: Place { file: train_json, frame: None, field: Some("frames".into()) },
+                place: Place { file: train_json, frame: None, field: Some("frames".into()) }.into(),
                 expected: "at least one image".into(),
                 found: "none (no frames, no images in them, or all of them excluded)".into(),
                 advice: "add a frame with file_paths and light_positions",
@@ -328,7 +328,7 @@ fn build_split(
             let path = find_image(root, &entry.file, &entry.place)?;
             if let Some(first) = first_use.insert(path.clone(), entry.place.clone()) {
                 return Err(DatasetError::Field {
-                    place: entry.place.clone(),
+                    place: entry.place.clone().into(),
                     expected: "an image that no other entry of the file names".into(),
                     found: format!("\"{}\", already named by {first}", entry.file),
                     advice: "an image has one camera and one light: remove one of the two entries",
@@ -393,7 +393,13 @@ fn intrinsics(frame: &Frame, first: &Shot, json: &Path, options: &OpenOptions) -
         let max_pixels = options.max_pixels;
         let named_by =
             Place { file: json.to_path_buf(), frame: Some(frame.index), field: Some("width, height".into()) };
-        return Err(DatasetError::TooLarge { path: first.path.clone(), named_by, width, height, max_pixels });
+        return Err(DatasetError::TooLarge {
+            path: first.path.clone(),
+            named_by: named_by.into(),
+            width,
+            height,
+            max_pixels,
+        });
     }
     let (centre_x, centre_y) = (0.5 * width as f32, 0.5 * height as f32);
     Ok(match frame.lens {

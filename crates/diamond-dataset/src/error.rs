@@ -38,7 +38,7 @@ pub enum DatasetError {
     /// The operating system refused to read or write a file.
     Io {
         /// Where the file is named, or the file itself.
-        place: Place,
+        place: Box<Place>,
         /// What was being done, for instance "open the image".
         action: &'static str,
         /// The system's reason.
@@ -58,7 +58,7 @@ pub enum DatasetError {
     /// A field is missing, has the wrong type, length or value.
     Field {
         /// File, frame and field.
-        place: Place,
+        place: Box<Place>,
         /// What the field must be.
         expected: String,
         /// What is there.
@@ -69,7 +69,7 @@ pub enum DatasetError {
     /// A path leads out of the capture's folder: `..`, an absolute path, or a link.
     Outside {
         /// File, frame and field that name the path.
-        place: Place,
+        place: Box<Place>,
         /// The path as written.
         path: String,
     },
@@ -78,7 +78,7 @@ pub enum DatasetError {
         /// The image file.
         path: PathBuf,
         /// The frame and field that name it.
-        named_by: Place,
+        named_by: Box<Place>,
         /// What is wrong.
         reason: String,
         /// What to do about it.
@@ -89,7 +89,7 @@ pub enum DatasetError {
         /// The image file.
         path: PathBuf,
         /// The frame and field that name it.
-        named_by: Place,
+        named_by: Box<Place>,
         /// Width in the header, pixels.
         width: u32,
         /// Height in the header, pixels.
@@ -165,6 +165,6 @@ impl std::error::Error for DatasetError {
 impl DatasetError {
     /// An error of the operating system about a file.
     pub(crate) fn io(path: &Path, action: &'static str, source: std::io::Error) -> Self {
-        DatasetError::Io { place: Place::file(path), action, source }
+        DatasetError::Io { place: Box::new(Place::file(path)), action, source }
     }
 }

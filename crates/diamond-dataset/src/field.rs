@@ -37,7 +37,7 @@ impl<'a> Object<'a> {
         match value {
             Value::Object(map) => Ok(Self { map, file, frame }),
             other => Err(DatasetError::Field {
-                place: Place { file: file.to_path_buf(), frame, field: None },
+                place: Place { file: file.to_path_buf(), frame, field: None }.into(),
                 expected: what.to_string(),
                 found: describe(other),
                 advice: "see the capture layout in the documentation",
@@ -58,7 +58,7 @@ impl<'a> Object<'a> {
         found: impl Into<String>,
         advice: &'static str,
     ) -> DatasetError {
-        DatasetError::Field { place: self.place(field), expected: expected.into(), found: found.into(), advice }
+        DatasetError::Field { place: self.place(field).into(), expected: expected.into(), found: found.into(), advice }
     }
 
     /// The value of a field; JSON `null` counts as absent.

@@ -6,11 +6,11 @@ use std::path::{Component, Path, PathBuf};
 /// below `root` (which must be canonical). Absolute paths, paths that climb out with `..`, and links that lead out are
 /// refused; a missing file is an I/O error. `place` is who names the path.
 pub(crate) fn resolve(root: &Path, relative: &str, place: &Place) -> Result<PathBuf, DatasetError> {
-    let outside = || DatasetError::Outside { place: place.clone(), path: relative.to_string() };
+    let outside = || DatasetError::Outside { place: place.clone().into(), path: relative.to_string() };
     let lexical = lexical(relative).ok_or_else(outside)?;
     let full = root.join(&lexical);
     let canonical = full.canonicalize().map_err(|source| DatasetError::Io {
-        place: Place { file: place.file.clone(), frame: place.frame, field: Some(named(place, &lexical)) },
+        place: Place { file: place.file.clone(), frame: place.frame, field: Some(named(place, &lexical)) }.into(),
         action: "find the image",
         source,
     })?;

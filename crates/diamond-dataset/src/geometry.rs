@@ -24,7 +24,7 @@ impl View {
         let Some(path) = &self.geometry else { return Ok(None) };
         let bad = |reason: String| DatasetError::Image {
             path: path.clone(),
-            named_by: Place::file(path),
+            named_by: Place::file(path).into(),
             reason,
             advice: ADVICE,
         };

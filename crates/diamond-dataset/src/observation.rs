@@ -30,7 +30,7 @@ impl Capture {
         let premultiplied = stored.alpha_channel().is_none() || self.alpha_premultiplied();
         observe(&stored, self.options.transfer, premultiplied).map(Arc::new).map_err(|e| DatasetError::Image {
             path: shot.path.clone(),
-            named_by: shot.named_by.clone(),
+            named_by: shot.named_by.clone().into(),
             reason: e.to_string(),
             advice: "export the image again",
         })

@@ -70,7 +70,7 @@ impl StoredImage {
 pub(crate) fn read_stored(shot: &Shot, max_pixels: u64) -> Result<StoredImage, DatasetError> {
     let bad = |reason: String, advice: &'static str| DatasetError::Image {
         path: shot.path.clone(),
-        named_by: shot.named_by.clone(),
+        named_by: shot.named_by.clone().into(),
         reason,
         advice,
     };
@@ -119,14 +119,14 @@ pub(crate) fn read_size(path: &Path, named_by: &Place) -> Result<(u32, u32), Dat
 
 /// A decoder that has read the header, and the length of the file in bytes.
 fn open(path: &Path, named_by: &Place) -> Result<(PngDecoder<BufReader<File>>, u64), DatasetError> {
-    let io = |source| DatasetError::Io { place: named_by.clone(), action: "open the image", source };
+    let io = |source| DatasetError::Io { place: named_by.clone().into(), action: "open the image", source };
     let file = File::open(path).map_err(io)?;
     let file_bytes = file.metadata().map_err(io)?.len();
     let mut limits = Limits::no_limits();
     limits.max_alloc = Some(DECODER_BYTES_BESIDES);
     let decoder = PngDecoder::with_limits(BufReader::new(file), limits).map_err(|e| DatasetError::Image {
         path: path.to_path_buf(),
-        named_by: named_by.clone(),
+        named_by: named_by.clone().into(),
         reason: format!("cannot read the PNG header ({e})"),
         advice: ADVICE,
     })?;
@@ -134,5 +134,5 @@ fn open(path: &Path, named_by: &Place) -> Result<(PngDecoder<BufReader<File>>, u
 }
 
 fn too_large(path: &Path, named_by: &Place, (width, height): (u32, u32), max_pixels: u64) -> DatasetError {
-    DatasetError::TooLarge { path: path.to_path_buf(), named_by: named_by.clone(), width, height, max_pixels }
+    DatasetError::TooLarge { path: path.to_path_buf(), named_by: named_by.clone().into(), width, height, max_pixels }
 }

@@ -291,7 +291,7 @@ impl Capture {
     pub fn pixels_of(&self, split: Split, view: usize, shot: usize) -> Result<Pixels, DatasetError> {
         let found = self.views(split).get(view).and_then(|v| v.shots.get(shot));
         let shot = found.ok_or_else(|| DatasetError::Field {
-            place: Place { file: self.root.clone(), frame: Some(view), field: Some(format!("shot {shot}")) },
+            place: Place { file: self.root.clone(), frame: Some(view), field: Some(format!("shot {shot}")) }.into(),
             expected: "an image of this capture".into(),
             found: "nothing".into(),
             advice: "describe this capture, not another",
