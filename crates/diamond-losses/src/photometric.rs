@@ -1,0 +1,147 @@
+//! The photometric loss: absolute difference and structural dissimilarity of the rendered image and the photograph.
+use diamond_image::{Image, Transfer};
+use diamond_metrics::{SsimWindow, ssim_mean_and_grad};
+
+use crate::LossError;
+use crate::average::{finite, subgradient};
+use crate::error::expect_finite;
+
+/// How rendered image and photograph are compared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PhotometricOptions {
+    /// λ in `[0, 1]`: weight of 1 − SSIM, against 1 − λ of the absolute difference.
+    pub lambda_ssim: f32,
+    /// Weight ≥ 0 of the mean squared difference, in addition (0: off).
+    pub lambda_l2: f32,
+    /// The space in which the differences are taken. Both images are given in linear RGB and encoded first;
+    /// [`Transfer::Linear`] compares radiance itself.
+    pub space: Transfer,
+    /// How SSIM treats the image's edge.
+    pub window: SsimWindow,
+}
+
+impl Default for PhotometricOptions {
+    fn default() -> Self {
+        Self { lambda_ssim: 0.2, lambda_l2: 0.0, space: Transfer::Linear, window: SsimWindow::ZeroPadded }
+    }
+}
+
+/// Value and gradient of [`photometric`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct PhotometricLoss {
+    /// `weight·((1 − λ)·l1 + λ·dssim + λ₂·l2)`.
+    pub value: f32,
+    /// Mean absolute difference, unweighted.
+    pub l1: f32,
+    /// 1 − SSIM, unweighted; 0 and not computed where λ is 0.
+    pub dssim: f32,
+    /// Mean squared difference, unweighted.
+    pub l2: f32,
+    /// Gradient of `value` with respect to the rendered image (its shape, in linear RGB).
+    pub grad: Image,
+}
+
+/// `[eq:photometric]` `weight·((1 − λ)·mean|I − G| + λ·(1 − SSIM(I, G)) + λ₂·mean (I − G)²)` of the rendered image I
+/// and the photograph G: linear RGB (or any number of channels) of equal shape, compared in `options.space`.
+///
+/// `weight` ≥ 0 is the sample's weight, e.g. ½ for a synthetic image. One fused pass gives the SSIM and its gradient;
+/// with λ = 0 SSIM is not computed. The gradient of |·| at 0 is 0.
+///
+/// Errors: unequal shapes, no pixels, NaN or infinity, λ outside `[0, 1]`, a negative weight, a window that does not fit.
+pub fn photometric(
+    rendered: &Image,
+    target: &Image,
+    options: &PhotometricOptions,
+    weight: f32,
+) -> Result<PhotometricLoss, LossError> {
+    let lambda = options.lambda_ssim;
+    if !(0.0..=1.0).contains(&lambda) {
+        let what = "photometric loss: lambda_ssim";
+        return Err(LossError::Parameter { what, expected: "a number from 0 to 1", found: lambda });
+    }
+    for (what, v) in [("photometric loss: lambda_l2", options.lambda_l2), ("photometric loss: weight", weight)] {
+        if !(0.0..f32::INFINITY).contains(&v) {
+            return Err(LossError::Parameter { what, expected: "a finite number that is not negative", found: v });
+        }
+    }
+    target.expect_same_shape(rendered, "photometric loss: photograph")?;
+    expect_finite(rendered, "photometric loss: rendered image")?;
+    expect_finite(target, "photometric loss: photograph")?;
+    if rendered.data().is_empty() {
+        let expected = "at least one pixel".to_owned();
+        return Err(LossError::Shape { what: "photometric loss", expected, found: "none".to_owned() });
+    }
+    if options.space == Transfer::Linear {
+        return compare(rendered, target, options, weight);
+    }
+    let seen = options.space.encode_image(rendered);
+    let mut loss = compare(&seen, &options.space.encode_image(target), options, weight)?;
+    for (g, &linear) in loss.grad.data_mut().iter_mut().zip(rendered.data()) {
+        *g = options.space.encode_pull(linear, *g);
+    }
+    Ok(loss)
+}
+
+fn compare(a: &Image, b: &Image, options: &PhotometricOptions, weight: f32) -> Result<PhotometricLoss, LossError> {
+    let (width, height, channels) = a.shape();
+    let scale = 1.0 / a.data().len() as f64;
+    let weight = f64::from(weight);
+    let lambda = f64::from(options.lambda_ssim);
+    let lambda_l2 = f64::from(options.lambda_l2);
+    let (dssim, mut grad) = if lambda > 0.0 {
+        let (mean, grad) = ssim_mean_and_grad(a, b, options.window)?;
+        (1.0 - mean, grad)
+    } else {
+        (0.0, Image::new(width, height, channels))
+    };
+    let (step_ssim, step_l1) = ((-weight * lambda) as f32, (weight * (1.0 - lambda) * scale) as f32);
+    let step_l2 = 2.0 * weight * lambda_l2 * scale;
+    let (mut l1, mut l2) = (0.0f64, 0.0f64);
+    let row = (width * channels).max(1);
+    for ((g, a), b) in grad.data_mut().chunks_mut(row).zip(a.data().chunks(row)).zip(b.data().chunks(row)) {
+        let (mut row_l1, mut row_l2) = (0.0f64, 0.0f64);
+        for i in 0..g.len() {
+            // In f64: the difference of two finite f32 may overflow f32.
+            let d = f64::from(a[i]) - f64::from(b[i]);
+            row_l1 += d.abs();
+            row_l2 += d * d;
+            g[i] = step_ssim * g[i] + step_l1 * subgradient(d as f32) + finite(step_l2 * d);
+        }
+        l1 += row_l1;
+        l2 += row_l2;
+    }
+    let (l1, l2) = (l1 * scale, l2 * scale);
+    let value = weight * ((1.0 - lambda) * l1 + lambda * dssim + lambda_l2 * l2);
+    Ok(PhotometricLoss { value: finite(value), l1: finite(l1), dssim: dssim as f32, l2: finite(l2), grad })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// [eq:photometric] parts add up, and the weight scales all.
+    #[test]
+    fn parts_and_weight() {
+        let a = Image::from_vec(4, 3, 3, (0..36).map(|i| (i as f32 * 0.7).sin().abs()).collect()).unwrap();
+        let b = a.map(|v| v * 0.5 + 0.1);
+        let options = PhotometricOptions { lambda_ssim: 0.3, lambda_l2: 2.0, ..Default::default() };
+        let one = photometric(&a, &b, &options, 1.0).unwrap();
+        let half = photometric(&a, &b, &options, 0.5).unwrap();
+        assert!((one.value - (0.7 * one.l1 + 0.3 * one.dssim + 2.0 * one.l2)).abs() < 1e-6);
+        assert!((half.value - 0.5 * one.value).abs() < 1e-7 && half.l1 == one.l1);
+        for (g, h) in one.grad.data().iter().zip(half.grad.data()) {
+            assert!((0.5 * g - h).abs() < 1e-7);
+        }
+    }
+
+    #[test]
+    fn parameters_are_checked() {
+        let a = Image::new(2, 2, 3);
+        for (lambda_ssim, lambda_l2, weight) in
+            [(1.5, 0.0, 1.0), (f32::NAN, 0.0, 1.0), (0.2, -1.0, 1.0), (0.2, 0.0, -1.0)]
+        {
+            let options = PhotometricOptions { lambda_ssim, lambda_l2, ..Default::default() };
+            assert!(matches!(photometric(&a, &a, &options, weight), Err(LossError::Parameter { .. })));
+        }
+    }
+}
