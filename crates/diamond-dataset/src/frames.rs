@@ -151,7 +151,7 @@ fn parse_lens(top: &Object, frame: &Object) -> Result<Lens, DatasetError> {
     };
     let angle = |object: &Object| -> Result<Option<Lens>, DatasetError> {
         let Some(fov_x) = object.number("camera_angle_x")?.map(|v| v as f32) else { return Ok(None) };
-        if fov_x < 1e-4 || fov_x > std::f32::consts::PI - 1e-3 {
+        if !(1e-4..=std::f32::consts::PI - 1e-3).contains(&fov_x) {
             return Err(object.error(
                 "camera_angle_x",
                 "a horizontal field of view in radians, between 0 and π",
@@ -161,10 +161,9 @@ fn parse_lens(top: &Object, frame: &Object) -> Result<Lens, DatasetError> {
         }
         Ok(Some(Lens::FovX { fov_x, cx, cy }))
     };
-    for lens in [focal(frame)?, angle(frame)?, focal(top)?, angle(top)?] {
-        if let Some(lens) = lens {
-            return Ok(lens);
-        }
+    let lenses = [focal(frame)?, angle(frame)?, focal(top)?, angle(top)?];
+    if let Some(lens) = lenses.into_iter().flatten().next() {
+        return Ok(lens);
     }
     let advice = "add camera_angle_x (radians) at the top level, or fl_x fl_y cx cy (pixels) to the frame";
     Err(frame.error("camera_angle_x", "a field of view or a focal length", "neither", advice))

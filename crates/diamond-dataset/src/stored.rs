@@ -52,7 +52,7 @@ impl StoredImage {
 
     /// The channel of the alpha, if there is one.
     pub(crate) fn alpha_channel(&self) -> Option<usize> {
-        (self.channels % 2 == 0).then_some(self.channels - 1)
+        self.channels.is_multiple_of(2).then_some(self.channels - 1)
     }
 
     /// The stored values of a pixel in `[0, 1]`: `[r, g, b, alpha]`; grey is repeated, a missing alpha is 1.

@@ -33,7 +33,7 @@ impl Scratch {
 
     /// The message of the error of opening, which must be one.
     pub fn refusal(&self) -> String {
-        self.open().err().expect("this capture must be refused").to_string()
+        self.open().expect_err("this capture must be refused").to_string()
     }
 }
 
