@@ -25,7 +25,8 @@ use std::f32::consts::FRAC_1_PI;
 pub enum Diffuse {
     /// (1 − metalness)·base_color/π. Together with the mirror it may return more light than arrives.
     Lambert,
-    /// (1 − F)·0.96·(1 − metalness)·base_color/π: what the mirror took is not diffused again (SSS-3DGS).
+    /// (1 − F)·0.96·(1 − metalness)·base_color/π: what the facet between viewer and light mirrored is not diffused again
+    /// (SSS-3DGS). White dielectrics seen from above lose a little; seen at grazing angles they still gain up to a quarter.
     #[default]
     FresnelWeighted,
 }

@@ -199,8 +199,7 @@ impl ShadePullback<'_> {
                 let mut d_features = [0.0; channel::COUNT];
                 d_features[channel::GEOMETRY].copy_from_slice(&geometry);
                 d_features[channel::TRANSPORT].copy_from_slice(&transported);
-                let (d_sums, d_opacity, d_depth) =
-                    blended.pull(&d_features, d_opacity, d_depth, self.config.normalise);
+                let (d_sums, d_opacity, d_depth) = blended.pull(&d_features, d_opacity, d_depth, self.config.normalise);
                 out[..channel::COUNT].copy_from_slice(&d_sums);
                 out[channel::COUNT] = d_opacity;
                 out[channel::COUNT + 1] = d_depth;

@@ -27,7 +27,10 @@ impl std::fmt::Display for ShadingError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             ShadingError::Shape { what, expected, found } => {
-                write!(f, "{what}: expected {expected}, found {found}; pass arrays or images that describe the same rows or pixels")
+                write!(
+                    f,
+                    "{what}: expected {expected}, found {found}; pass arrays or images that describe the same rows or pixels"
+                )
             }
             ShadingError::Setting { what, expected, found } => {
                 write!(f, "{what}: expected {expected}, found {found}; change the setting")

@@ -51,11 +51,7 @@ pub fn visibility(coefficients: &[f32; COEFFICIENTS], light: Vec3) -> f32 {
 /// Pullback of [`visibility`]: `(d_coefficients, d_light)`, zero where the sum is outside `[0, 1]`.
 /// `[eq:sh-visibility]`
 #[inline]
-pub fn visibility_pull(
-    coefficients: &[f32; COEFFICIENTS],
-    light: Vec3,
-    d_out: f32,
-) -> ([f32; COEFFICIENTS], Vec3) {
+pub fn visibility_pull(coefficients: &[f32; COEFFICIENTS], light: Vec3, d_out: f32) -> ([f32; COEFFICIENTS], Vec3) {
     let y = basis(light);
     if !(0.0..=1.0).contains(&raw(coefficients, &y)) {
         return ([0.0; COEFFICIENTS], Vec3::ZERO);
@@ -86,12 +82,12 @@ pub fn visibilities(coefficients: &[f32], lights: &[Vec3]) -> Result<Vec<f32>, S
 /// # Errors
 /// [`ShadingError::Shape`] where lengths disagree.
 /// `[eq:sh-visibility]`
-pub fn visibilities_pull(
-    coefficients: &[f32],
-    lights: &[Vec3],
-    d_out: &[f32],
-) -> Result<VisibilityGrad, ShadingError> {
-    check_length("visibilities_pull: coefficients (16 per direction)", lights.len() * COEFFICIENTS, coefficients.len())?;
+pub fn visibilities_pull(coefficients: &[f32], lights: &[Vec3], d_out: &[f32]) -> Result<VisibilityGrad, ShadingError> {
+    check_length(
+        "visibilities_pull: coefficients (16 per direction)",
+        lights.len() * COEFFICIENTS,
+        coefficients.len(),
+    )?;
     check_length("visibilities_pull: d_out (one per direction)", lights.len(), d_out.len())?;
     let (points, _) = coefficients.as_chunks::<COEFFICIENTS>();
     let mut d_coefficients = vec![0.0; coefficients.len()];

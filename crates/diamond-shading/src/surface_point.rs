@@ -117,13 +117,7 @@ impl ShadingConfig {
 impl SurfacePoint {
     /// From the light-independent channels of a pixel, divided by its opacity.
     /// `[eq:surface-point]`
-    pub fn new(
-        features: &[f32; GEOMETRY],
-        depth: f32,
-        pixel: Vec2,
-        camera: &Camera,
-        config: &ShadingConfig,
-    ) -> Self {
+    pub fn new(features: &[f32; GEOMETRY], depth: f32, pixel: Vec2, camera: &Camera, config: &ShadingConfig) -> Self {
         let view = -camera.ray(pixel).direction;
         let [r, g, b, roughness, metalness, subsurfaceness, x, y, z] = *features;
         let blended = Vec3::new(x, y, z);

@@ -33,16 +33,9 @@ pub fn pseudo_normals<R: Real>(
                 }
                 s
             };
-            let a = sum(
-                [(x + 1, y - 1), (x + 1, y), (x + 1, y + 1)],
-                [(x - 1, y - 1), (x - 1, y), (x - 1, y + 1)],
-            );
-            let b = sum(
-                [(x - 1, y + 1), (x, y + 1), (x + 1, y + 1)],
-                [(x - 1, y - 1), (x, y - 1), (x + 1, y - 1)],
-            );
-            let cross =
-                [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+            let a = sum([(x + 1, y - 1), (x + 1, y), (x + 1, y + 1)], [(x - 1, y - 1), (x - 1, y), (x - 1, y + 1)]);
+            let b = sum([(x - 1, y + 1), (x, y + 1), (x + 1, y + 1)], [(x - 1, y - 1), (x, y - 1), (x + 1, y - 1)]);
+            let cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
             if dot(cross, point(x, y)).value() <= 0.0 {
                 continue;
             }
