@@ -22,7 +22,7 @@ pub enum FlipToneMapper {
     /// Rational fit of the ACES filmic curve (Narkowicz), its input scaled by 0.6, per channel.
     #[default]
     Aces,
-    /// Hable's filmic curve, white at 11.2, per channel.
+    /// Hable's filmic curve, white at 11.2, its input doubled (his exposure bias), per channel.
     Hable,
     /// Reinhard's 1/(1 + luminance), applied to all channels alike.
     Reinhard,
@@ -38,9 +38,9 @@ impl FlipToneMapper {
                 let (a, b, c, d, e, f) = (0.15, 0.50, 0.10, 0.20, 0.02, 0.30);
                 let curve = |x: f64| (x * (a * x + c * b) + d * e) / (x * (a * x + b) + d * f) - e / f;
                 let white = curve(11.2);
-                // One fraction over the common denominator, divided by the value of white.
-                let numerator = [a - a * e / f, c * b - b * e / f, 0.0];
-                [numerator[0] / white, numerator[1] / white, numerator[2] / white, a, b, d * f]
+                // One fraction over the common denominator, divided by the value of white, at twice the input.
+                let [p, q] = [a - a * e / f, c * b - b * e / f].map(|v| v / white);
+                [4.0 * p, 2.0 * q, 0.0, 4.0 * a, 2.0 * b, d * f]
             }
             FlipToneMapper::Reinhard => [0.0, 1.0, 0.0, 0.0, 1.0, 1.0],
         }
