@@ -99,7 +99,7 @@ pub fn files_below(root: &Path) -> Result<Vec<String>, String> {
             let kind = entry.file_type().map_err(|e| format!("{path}: {e}"))?;
             if kind.is_dir() {
                 // `out` and `target` are ours to skip at the top and in a package, never inside assets.
-                if !(SKIPPED.contains(&name.as_str()) && !path.starts_with("assets/")) {
+                if !SKIPPED.contains(&name.as_str()) || path.starts_with("assets/") {
                     waiting.push(path);
                 }
             } else {
