@@ -268,8 +268,12 @@ pub struct Residual {
     pub hidden: Vec<usize>,
     /// Leak of the hidden activations; 0 for ReLU.
     pub leak: f32,
+    /// Added to the incident head's first bias: with ReLU and 0 half of all starts are dark everywhere.
+    pub incident_bias: f32,
     /// Whether the incident head passes its gradient on.
     pub incident_gradient: bool,
+    /// Whether the network's gradient reaches the normals that it reads.
+    pub normal_gradient: bool,
     /// Multiply the residual by the light's intensity (and falloff, where physical), which keeps it linear in light.
     pub scale_by_light: bool,
     /// Learned latent values per Gaussian that the network reads.

@@ -1,7 +1,7 @@
 //! The CPU engine: one training step, written out in order.
 //!
 //! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
-use crate::forward::{self, Forward};
+use crate::forward;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
@@ -11,9 +11,8 @@ use crate::{
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
-use diamond_splat::{
-    DensityConfig, DensityStats, GaussiansGrad, OriginKind, plan_density, split_child,
-};
+use diamond_splat::GaussiansGrad;
+use diamond_splat::density::{self, DensityConfig, DensityStats, OriginKind, split_child};
 use std::path::Path;
 use std::time::Instant;
 
@@ -141,7 +140,7 @@ impl CpuEngine {
         let extent = self.model.scene.extent;
         let activated = self.model.parameters.activate();
         let g = &activated.gaussians;
-        let plan = plan_density(g, &self.stats, &config, extent).map_err(error::stage("density control"))?;
+        let plan = density::plan(g, &self.stats, &config, extent).map_err(error::stage("density control"))?;
         if plan.origins.is_empty() {
             // Everything would be pruned (an all-black capture, say): keep the set rather than end with nothing.
             self.stats = DensityStats::new(self.model.len());
@@ -219,19 +218,33 @@ impl Engine for CpuEngine {
                 false => None,
             };
             let light = self.model.scene.scaled_light(pair.light);
-            let forward = Forward::run(&self.model, &activated, pair.camera, &light, traced, &settings, &mut self.profile)?;
-            let t = Instant::now();
-            let outcome = objective::evaluate(&self.model.config, plan, &forward, pair, share)?;
-            self.profile.add("objective", t);
-            terms.add(&outcome.terms, share);
-            psnr += outcome.psnr * share;
-            visible = forward.visible().len();
-            let pulled = forward.pull(&outcome.grad, &mut self.profile)?;
+            let config = self.model.config.clone();
+            let mut outcome = None;
+            let pulled = forward::value_and_grad(
+                &self.model,
+                &activated,
+                pair.camera,
+                &light,
+                traced,
+                &settings,
+                &mut self.profile,
+                |view| {
+                    let mut o = objective::evaluate(&config, plan, view, pair, share)?;
+                    let grad = std::mem::take(&mut o.grad);
+                    outcome = Some(o);
+                    Ok(grad)
+                },
+            )?;
+            if let Some(outcome) = outcome {
+                terms.add(&outcome.terms, share);
+                psnr += outcome.psnr * share;
+            }
+            visible = pulled.visible;
             let t = Instant::now();
             if plan.collect_density {
                 let k = &pair.camera.intrinsics;
                 self.stats
-                    .add(&pulled.screen, &pulled.radii, pulled.visible.as_slice(), k.width as usize, k.height as usize)
+                    .record(&pulled.screen, &pulled.radii, k.width, k.height)
                     .map_err(error::stage("density statistics"))?;
             }
             pulled.add_to(&mut total, &mut network_grad)?;
@@ -306,10 +319,11 @@ impl Engine for CpuEngine {
             file.insert(format!("visibility.{name}"), &[values.len()], values.to_vec());
             file.metadata.insert(format!("visibility.{name}.step"), step.to_string());
         }
-        let (gradient_sums, counts, radii) = self.stats.to_parts();
-        file.insert("density.gradient_sums", &[n], gradient_sums);
-        file.insert("density.counts", &[n], counts);
-        file.insert("density.radii", &[n], radii);
+        // Counts are far below 2²⁴, so f32 holds them exactly.
+        let views = self.stats.views.iter().map(|&v| v as f32).collect();
+        file.insert("density.gradient_sum", &[n], self.stats.gradient_sum.clone());
+        file.insert("density.views", &[n], views);
+        file.insert("density.max_radius", &[n], self.stats.max_radius.clone());
         file.metadata.insert("gaussians".into(), n.to_string());
         Ok(file)
     }
@@ -335,9 +349,11 @@ impl Engine for CpuEngine {
                 moments.second = state.take(path, &format!("network.{name}.second_moment"), size)?;
             }
         }
-        let parts = ["density.gradient_sums", "density.counts", "density.radii"];
-        let [sums, counts, radii] = parts.map(|name| state.take(path, name, n));
-        self.stats = DensityStats::from_parts(sums?, counts?, radii?).map_err(error::stage("density statistics"))?;
+        self.stats = DensityStats {
+            gradient_sum: state.take(path, "density.gradient_sum", n)?,
+            views: state.take(path, "density.views", n)?.iter().map(|&v| v as u32).collect(),
+            max_radius: state.take(path, "density.max_radius", n)?,
+        };
         self.visibility = VisibilityCache::default();
         let names: Vec<String> = state.tensors.keys().filter(|k| k.starts_with("visibility.")).cloned().collect();
         for name in names {

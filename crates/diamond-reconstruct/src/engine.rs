@@ -4,7 +4,7 @@ use crate::{Model, ReconstructError, StepPlan, TensorFile};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask};
 use diamond_light::OlatLight;
-use diamond_shading::deferred::ShadedMaps;
+use diamond_shading::ShadedMaps;
 use std::path::Path;
 
 /// One photograph to learn from.

@@ -4,9 +4,12 @@ use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::tensor_file::write_atomically;
 use crate::{
-    Attribute, Config, GaussianParameters, InitialNormals, ReconstructError, Scene, TensorFile, error, logit,
+    Attribute, Config, GaussianParameters, InitialNormals, ReconstructError, Rendering, Scene, TensorFile, error,
+    forward, logit,
 };
-use diamond_shading::residual::{ResidualNetwork, ResidualNetworkConfig};
+use diamond_camera::Camera;
+use diamond_light::OlatLight;
+use diamond_shading::{Activation, Mlp, ResidualNetwork, ResidualNetworkConfig};
 use diamond_splat::{PlyTable, ScalarType, mean_squared_distance_to_nearest, read_ply, write_ply};
 use glam::{Quat, Vec3};
 use std::path::Path;
@@ -39,15 +42,13 @@ pub(crate) fn transfer_width(degree: Option<u32>) -> usize {
 /// The network's shape under a configuration.
 pub(crate) fn network_config(config: &Config) -> ResidualNetworkConfig {
     let mut out = ResidualNetworkConfig::sss_3dgs();
-    out.hidden = config.residual.hidden.clone();
-    out.activation = if config.residual.leak > 0.0 {
-        diamond_shading::mlp::Activation::LeakyRelu(config.residual.leak)
-    } else {
-        diamond_shading::mlp::Activation::Relu
-    };
-    out.codes = config.residual.codes;
+    out.trunk = config.residual.hidden.clone();
+    out.hidden =
+        if config.residual.leak > 0.0 { Activation::LeakyRelu(config.residual.leak) } else { Activation::Relu };
+    out.code_size = config.residual.codes;
+    out.incident_bias = config.residual.incident_bias;
     if config.shading.incident != crate::IncidentVariant::Learned {
-        out.incident_hidden = None;
+        out.incident_head = None;
     }
     out
 }
@@ -97,6 +98,11 @@ impl Model {
         };
         let network_moments = network_moments(network.as_ref());
         Ok(Self { parameters, network, network_moments, scene, config: config.clone() })
+    }
+
+    /// Renders one camera under each light: one projection and one rasterisation per group of lights.
+    pub fn render(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
+        forward::render(self, camera, lights)
     }
 
     /// Number of Gaussians.
@@ -188,7 +194,7 @@ impl Model {
         let mut push = |name: String, attribute: Attribute, column: usize| {
             let group = p.group(attribute);
             let values = group.values.iter().skip(column).step_by(group.width).copied().collect();
-            table.push(name, ScalarType::Float32, values);
+            table.push(name, ScalarType::F32, values);
         };
         let axes = ["x", "y", "z"];
         for (k, name) in axes.iter().enumerate() {
@@ -218,7 +224,7 @@ impl Model {
         let activated = p.activate();
         for k in 0..3 {
             let values = activated.base_color.iter().map(|c| (c[k] - 0.5) / SH_DEGREE_0).collect();
-            table.push(format!("f_dc_{k}"), ScalarType::Float32, values);
+            table.push(format!("f_dc_{k}"), ScalarType::F32, values);
         }
         table
     }
@@ -285,6 +291,6 @@ pub(crate) fn network_parts_mut(network: &mut ResidualNetwork) -> Vec<(&'static 
 
 fn network_moments(network: Option<&ResidualNetwork>) -> [Moments; 3] {
     let Some(network) = network else { return Default::default() };
-    let of = |m: &diamond_shading::mlp::Mlp| Moments::zeros(m.parameters.len());
+    let of = |m: &Mlp| Moments::zeros(m.parameters.len());
     [of(&network.trunk), of(&network.residual_head), network.incident_head.as_ref().map(of).unwrap_or_default()]
 }

@@ -4,7 +4,7 @@ use diamond_camera::Camera;
 use diamond_dataset::{Capture, Observation};
 use diamond_image::Mask;
 use diamond_light::{Falloff, OlatLight};
-use diamond_splat::{PointCloud, read_point_cloud, scene_bounds_from_masks, visual_hull};
+use diamond_splat::PointCloud;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -102,16 +102,8 @@ fn from_hull(capture: &Capture, config: &Config) -> Result<Option<InitialPoints>
     }
     let cameras: Vec<Camera> = masks.iter().map(|(c, _)| *c).collect();
     let coverage: Vec<&Mask> = masks.iter().map(|(_, m)| m).collect();
-    let Some(bounds) = scene_bounds_from_masks(&cameras, &coverage) else { return Ok(None) };
-    let hull = visual_hull(&cameras, &coverage, bounds, config.initial.hull_resolution)
-        .map_err(error::stage("visual hull"))?;
-    if hull.points.is_empty() {
-        return Ok(None);
-    }
-    let cloud = PointCloud { positions: hull.points, normals: Some(hull.normals), colors: None };
-    let mut points = from_cloud(cloud, config.initial.count);
-    points.origin = format!("visual hull of {} masks", masks.len());
-    Ok(Some(points))
+    let _ = (cameras, coverage); // HULL
+    return Ok(None);
 }
 
 fn uniform(centre: Vec3, radius: f32, config: &Config) -> InitialPoints {
@@ -133,7 +125,7 @@ pub fn survey(capture: &Capture, config: &Config) -> Result<(Scene, InitialPoint
         InitialSource::Uniform => None,
         InitialSource::Points | InitialSource::Auto if capture.points.is_some() => {
             let path = capture.points.as_ref().ok_or_else(|| unusable("no point cloud"))?;
-            let cloud = read_point_cloud(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })?;
+            let cloud = PointCloud::read(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })?;
             let mut points = from_cloud(cloud, config.initial.count);
             points.origin = format!("{} points of {}", points.positions.len(), path.display());
             (!points.positions.is_empty()).then_some(points)

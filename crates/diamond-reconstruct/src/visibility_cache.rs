@@ -1,5 +1,5 @@
 //! Traced visibility of every Gaussian toward every light, traced again only when it is old.
-use crate::{Config, ReconstructError};
+use crate::{Config, ReconstructError, error};
 use diamond_light::OlatLight;
 use diamond_splat::{GaussianBvh, Gaussians, VisibilityConfig};
 use glam::Vec3;
@@ -29,11 +29,26 @@ fn key(light: &OlatLight) -> LightKey {
     [kind, v.x.to_bits(), v.y.to_bits(), v.z.to_bits()]
 }
 
-/// Traces one light afresh.
-pub fn trace(gaussians: &Gaussians, normals: &[Vec3], light: &OlatLight) -> Result<Vec<f32>, ReconstructError> {
-    let config = VisibilityConfig::default();
-    let bvh = GaussianBvh::build(gaussians).map_err(crate::error::stage("visibility"))?;
-    bvh.visibility_to_light(gaussians, Some(normals), light, &config).map_err(crate::error::stage("visibility"))
+/// A hierarchy over the Gaussians as they stand, for any number of lights.
+pub struct Tracer(GaussianBvh);
+
+impl Tracer {
+    /// Builds the hierarchy.
+    pub fn new(gaussians: &Gaussians) -> Result<Self, ReconstructError> {
+        GaussianBvh::build(gaussians).map(Self).map_err(error::stage("visibility"))
+    }
+
+    /// Visibility of every Gaussian toward one light.
+    pub fn trace(
+        &self,
+        gaussians: &Gaussians,
+        normals: &[Vec3],
+        light: &OlatLight,
+    ) -> Result<Vec<f32>, ReconstructError> {
+        self.0
+            .visibility_to_light(gaussians, Some(normals), light, &VisibilityConfig::default())
+            .map_err(error::stage("visibility"))
+    }
 }
 
 impl VisibilityCache {
@@ -53,7 +68,7 @@ impl VisibilityCache {
         });
         if !fresh {
             self.traced += 1;
-            let values = trace(gaussians, normals, light)?;
+            let values = Tracer::new(gaussians)?.trace(gaussians, normals, light)?;
             self.entries.insert(key, (step, values));
             if self.entries.len() > MAX_LIGHTS
                 && let Some(oldest) = self.entries.iter().min_by_key(|(k, (s, _))| (*s, **k)).map(|(k, _)| *k)

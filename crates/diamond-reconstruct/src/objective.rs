@@ -1,0 +1,245 @@
+//! The objective: every single-view term with its weight, value and gradient. A term of weight 0 is not computed.
+use crate::forward::{PairGrad, View, ViewGrad};
+use crate::random::Random;
+use crate::{ActivatedGrad, Attribute, Config, Model, ReconstructError, StepPlan, TrainingPair, error};
+use diamond_image::{Image, Transfer};
+use diamond_light::{OlatLight, spherical_harmonics::COEFFICIENTS};
+use diamond_losses::{Average, PhotometricOptions, Term};
+use diamond_metrics::SsimWindow;
+use diamond_shading::pseudo_normals;
+use diamond_shading::sh_visibility::{visibilities, visibilities_pull};
+use glam::Vec3;
+
+/// One term's name, weight and value.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TermValue {
+    /// Name, as in [`diamond_losses::TERMS`] (the photometric term is listed as l1, dssim and l2).
+    pub name: &'static str,
+    /// Weight λ in the objective.
+    pub weight: f32,
+    /// Value before weighting.
+    pub value: f32,
+}
+
+/// The terms of a step.
+#[derive(Debug, Clone, Default)]
+pub struct Terms {
+    /// In order of first appearance.
+    pub values: Vec<TermValue>,
+}
+
+impl Terms {
+    /// Adds `share` of each value.
+    pub fn add(&mut self, terms: &[TermValue], share: f32) {
+        for term in terms {
+            let value = term.value * share;
+            match self.values.iter_mut().find(|t| t.name == term.name) {
+                Some(t) => t.value += value,
+                None => self.values.push(TermValue { value, ..*term }),
+            }
+        }
+    }
+
+    /// The weighted sum.
+    pub fn objective(&self) -> f32 {
+        self.values.iter().map(|t| t.weight * t.value).sum()
+    }
+}
+
+/// What the objective says about one pair.
+pub struct Outcome {
+    /// Gradient, × the pair's share of the batch.
+    pub grad: ViewGrad,
+    /// Terms, not yet multiplied by the share.
+    pub terms: Vec<TermValue>,
+    /// PSNR in display sRGB, all pixels, dB.
+    pub psnr: f32,
+}
+
+fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
+    let target = to.get_or_insert_with(|| Image::new(from.width(), from.height(), from.channels()));
+    target.data_mut().iter_mut().zip(from.data()).for_each(|(a, b)| *a += b * scale);
+}
+
+/// PSNR of two linear images in display sRGB, clamped, peak 1, dB.
+pub fn display_psnr(rendered: &Image, target: &Image) -> f32 {
+    let encode = |v: f32| Transfer::Srgb.encode(v).clamp(0.0, 1.0);
+    let sum: f64 =
+        rendered.data().iter().zip(target.data()).map(|(a, b)| ((encode(*a) - encode(*b)) as f64).powi(2)).sum();
+    let mean = sum / rendered.data().len().max(1) as f64;
+    (-10.0 * mean.max(1e-12).log10()) as f32
+}
+
+/// Value and gradient of every image term for one pair, with weight `share` in the batch.
+pub fn evaluate(
+    config: &Config,
+    plan: &StepPlan,
+    view: &View<'_>,
+    pair: &TrainingPair<'_>,
+    share: f32,
+) -> Result<Outcome, ReconstructError> {
+    let loss = &config.loss;
+    let (shaded, maps) = (view.shaded, &view.shaded.maps);
+    let mut out = ViewGrad::default();
+    let mut terms = Vec::with_capacity(10);
+    let fail = error::stage("objective");
+
+    let options = PhotometricOptions {
+        lambda_ssim: loss.ssim,
+        lambda_l2: loss.l2,
+        space: loss.space.transfer(),
+        window: SsimWindow::ZeroPadded,
+    };
+    let photometric =
+        diamond_losses::photometric(&shaded.radiance, pair.radiance, &options, pair.weight).map_err(&fail)?;
+    let weight = pair.weight;
+    terms.push(TermValue { name: "l1", weight: weight * (1.0 - loss.ssim), value: photometric.l1 });
+    terms.push(TermValue { name: "dssim", weight: weight * loss.ssim, value: photometric.dssim });
+    if loss.l2 > 0.0 {
+        terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: photometric.l2 });
+    }
+    add_scaled(&mut out.shaded.radiance, &photometric.grad, share);
+
+    let mut push = |term: Term, weight: f32, value: f32| terms.push(TermValue { name: term.name(), weight, value });
+    if let (true, Some(mask)) = (loss.mask > 0.0, pair.mask) {
+        let l = diamond_losses::mask_bce(&view.raster.opacity, mask).map_err(&fail)?;
+        push(Term::Mask, loss.mask, l.value);
+        add_scaled(&mut out.opacity, &l.grad, share * loss.mask);
+    }
+    if loss.normal > 0.0 {
+        let (pseudo, _) = pseudo_normals(pair.camera, &maps.depth, &view.raster.opacity)
+            .map_err(error::stage("pseudo-normals"))?;
+        // Where the pseudo-normal is undefined the rendered normal takes its place and the difference is 0.
+        let mut target = pseudo;
+        for (t, n) in target.data_mut().chunks_exact_mut(3).zip(maps.normal.data().chunks_exact(3)) {
+            if t.iter().all(|v| *v == 0.0) {
+                t.copy_from_slice(n);
+            }
+        }
+        let l =
+            diamond_losses::normal_consistency(&maps.normal, &target, pair.mask, Average::AllPixels).map_err(&fail)?;
+        push(Term::Normal, loss.normal, l.value);
+        add_scaled(&mut out.shaded.maps.normal, &l.grad, share * loss.normal);
+    }
+    let roughness = if plan.roughness_frozen { 0.0 } else { loss.smooth_roughness };
+    let smooth = [
+        (Term::SmoothBaseColor, loss.smooth_base_color, &maps.base_color, &mut out.shaded.maps.base_color),
+        (Term::SmoothMetalness, loss.smooth_metalness, &maps.metalness, &mut out.shaded.maps.metalness),
+        (Term::SmoothRoughness, roughness, &maps.roughness, &mut out.shaded.maps.roughness),
+        (
+            Term::SmoothSubsurfaceness,
+            loss.smooth_subsurfaceness,
+            &maps.subsurfaceness,
+            &mut out.shaded.maps.subsurfaceness,
+        ),
+    ];
+    for (term, weight, map, grad) in smooth {
+        if weight > 0.0 {
+            let l = diamond_losses::smoothness(map, pair.radiance, pair.mask).map_err(&fail)?;
+            push(term, weight, l.value);
+            add_scaled(grad, &l.grad, share * weight);
+        }
+    }
+    if loss.enhancement > 0.0 {
+        let l = diamond_losses::enhancement(&maps.base_color, pair.radiance, pair.mask, Average::AllPixels)
+            .map_err(&fail)?;
+        push(Term::Enhancement, loss.enhancement, l.value);
+        add_scaled(&mut out.shaded.maps.base_color, &l.grad, share * loss.enhancement);
+    }
+    if loss.incident > 0.0 && config.shading.incident == crate::IncidentVariant::Learned {
+        let l = diamond_losses::incident_light(maps.incident.data(), maps.visibility.data()).map_err(&fail)?;
+        push(Term::Incident, loss.incident, l.value);
+        let (w, h, _) = maps.incident.shape();
+        let grad = Image::from_vec(w, h, 1, l.d_incident).map_err(error::stage("incident term"))?;
+        add_scaled(&mut out.shaded.maps.incident, &grad, share * loss.incident);
+    }
+    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance) })
+}
+
+/// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.
+pub fn visibility_term(
+    model: &Model,
+    random: &mut Random,
+    light: &OlatLight,
+    traced: &[f32],
+    share: f32,
+    d_sh: &mut Vec<f32>,
+) -> Result<TermValue, ReconstructError> {
+    let n = model.len();
+    let rows: Vec<usize> = match model.config.visibility.samples {
+        samples if samples >= n => (0..n).collect(),
+        samples => (0..samples).map(|_| random.below(n)).collect(),
+    };
+    let means = model.parameters.values(Attribute::Mean);
+    let all = model.parameters.values(Attribute::VisibilitySh);
+    let directions: Vec<Vec3> = rows
+        .iter()
+        .map(|&i| light.incidence(Vec3::from_slice(&means[3 * i..]), diamond_light::Falloff::None).direction)
+        .collect();
+    let sh: Vec<f32> = rows.iter().flat_map(|&i| all[i * COEFFICIENTS..(i + 1) * COEFFICIENTS].iter().copied()).collect();
+    let target: Vec<f32> = rows.iter().map(|&i| traced[i]).collect();
+    let fitted = visibilities(&sh, &directions).map_err(error::stage("visibility term"))?;
+    let l = diamond_losses::visibility(&fitted, &target).map_err(error::stage("visibility term"))?;
+    let pulled = visibilities_pull(&sh, &directions, &l.grad).map_err(error::stage("visibility term"))?;
+    d_sh.resize(n * COEFFICIENTS, 0.0);
+    let scale = share * model.config.loss.visibility;
+    for (row, &i) in rows.iter().enumerate() {
+        let from = &pulled.coefficients[row * COEFFICIENTS..(row + 1) * COEFFICIENTS];
+        for (a, b) in d_sh[i * COEFFICIENTS..(i + 1) * COEFFICIENTS].iter_mut().zip(from) {
+            *a += scale * b;
+        }
+    }
+    Ok(TermValue { name: Term::Visibility.name(), weight: model.config.loss.visibility, value: l.value })
+}
+
+/// Shrinkage of the transfer vectors' bands: Σ l²·t² / N, so that light it has not seen is interpolated smoothly.
+pub fn regularise(model: &Model, total: &mut ActivatedGrad, terms: &mut Terms) {
+    let weight = model.config.residual.transfer_smoothness;
+    let Some(degree) = model.config.residual.transfer_degree.filter(|_| weight > 0.0) else { return };
+    let values = model.parameters.values(Attribute::Transfer);
+    total.transfer.resize(values.len(), 0.0);
+    let coefficients = (degree as usize + 1) * (degree as usize + 1);
+    let scale = 1.0 / model.len().max(1) as f32;
+    let mut sum = 0.0f64;
+    for (i, (&t, d)) in values.iter().zip(&mut total.transfer).enumerate() {
+        let band = ((i % coefficients) as f32).sqrt().floor();
+        let factor = band * band * scale;
+        sum += (factor * t * t) as f64;
+        *d += weight * 2.0 * factor * t;
+    }
+    terms.add(&[TermValue { name: "transfer_smoothness", weight, value: sum as f32 }], 1.0);
+}
+
+fn add_vec(to: &mut Vec<f32>, from: &[f32]) {
+    if to.is_empty() {
+        to.extend_from_slice(from);
+    } else {
+        to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
+    }
+}
+
+fn add_vec3(to: &mut Vec<Vec3>, from: &[Vec3]) {
+    if to.is_empty() {
+        to.extend_from_slice(from);
+    } else {
+        to.iter_mut().zip(from).for_each(|(a, b)| *a += *b);
+    }
+}
+
+impl PairGrad {
+    /// Adds this pair's gradient to the batch's.
+    pub fn add_to(&self, total: &mut ActivatedGrad, network: &mut Vec<Vec<f32>>) -> Result<(), ReconstructError> {
+        let from = &self.activated;
+        total.gaussians.add_assign(&from.gaussians).map_err(error::stage("accumulate"))?;
+        add_vec3(&mut total.normals, &from.normals);
+        add_vec3(&mut total.base_color, &from.base_color);
+        add_vec(&mut total.roughness, &from.roughness);
+        add_vec(&mut total.metalness, &from.metalness);
+        add_vec(&mut total.subsurfaceness, &from.subsurfaceness);
+        add_vec(&mut total.transfer, &from.transfer);
+        add_vec(&mut total.codes, &from.codes);
+        network.resize(self.network.len().max(network.len()), Vec::new());
+        network.iter_mut().zip(&self.network).for_each(|(a, b)| add_vec(a, b));
+        Ok(())
+    }
+}
