@@ -40,9 +40,9 @@ pub use average::Average;
 pub use enhancement::{enhanced, enhancement};
 pub use error::LossError;
 pub use normal::{AlignmentLoss, NormalLoss, flatness, normal_alignment, normal_consistency};
-pub use photometric::{PhotometricLoss, PhotometricOptions, photometric};
+pub use photometric::{PhotometricLoss, PhotometricOptions, photometric, photometric_encoded};
 pub use silhouette::{OPACITY_MARGIN, mask_bce, mask_entropy, opacity_entropy};
-pub use smoothness::smoothness;
+pub use smoothness::{EdgeWeights, smoothness};
 pub use terms::{TERMS, Term, TermInfo};
 pub use visibility::{IncidentLoss, incident_light, visibility};
 

@@ -54,6 +54,27 @@ pub fn photometric(
     options: &PhotometricOptions,
     weight: f32,
 ) -> Result<PhotometricLoss, LossError> {
+    photometric_with(rendered, target, false, options, weight)
+}
+
+/// [`photometric`] with a photograph that is already encoded in `options.space`, as a file stores it: saves encoding it
+/// anew at every step.
+pub fn photometric_encoded(
+    rendered: &Image,
+    encoded_target: &Image,
+    options: &PhotometricOptions,
+    weight: f32,
+) -> Result<PhotometricLoss, LossError> {
+    photometric_with(rendered, encoded_target, true, options, weight)
+}
+
+fn photometric_with(
+    rendered: &Image,
+    target: &Image,
+    encoded: bool,
+    options: &PhotometricOptions,
+    weight: f32,
+) -> Result<PhotometricLoss, LossError> {
     let lambda = options.lambda_ssim;
     if !(0.0..=1.0).contains(&lambda) {
         let what = "photometric loss: lambda_ssim";
@@ -71,15 +92,33 @@ pub fn photometric(
         let expected = "at least one pixel".to_owned();
         return Err(LossError::Shape { what: "photometric loss", expected, found: "none".to_owned() });
     }
-    if options.space == Transfer::Linear {
+    let space = options.space;
+    if space == Transfer::Linear {
         return compare(rendered, target, options, weight);
     }
-    let seen = options.space.encode_image(rendered);
-    let mut loss = compare(&seen, &options.space.encode_image(target), options, weight)?;
-    for (g, &linear) in loss.grad.data_mut().iter_mut().zip(rendered.data()) {
-        *g = options.space.encode_pull(linear, *g);
+    let seen = space.encode_image(rendered);
+    let mut loss = if encoded {
+        compare(&seen, target, options, weight)
+    } else {
+        compare(&seen, &space.encode_image(target), options, weight)
+    }?;
+    for ((g, &linear), &stored) in loss.grad.data_mut().iter_mut().zip(rendered.data()).zip(seen.data()) {
+        *g = encode_pull(space, linear, stored, *g);
     }
     Ok(loss)
+}
+
+/// [`Transfer::encode_pull`] where the stored value is known as well, which saves a power: for a power law with exponent
+/// 1/γ the slope is (stored + offset)/(γ·linear).
+fn encode_pull(space: Transfer, linear: f32, stored: f32, d_stored: f32) -> f32 {
+    // Below, sRGB is straight, and γ 2.2 so steep that its slope is guarded.
+    const POWER_LAW: f32 = 0.004;
+    let v = linear.abs();
+    match space {
+        Transfer::Srgb if v > POWER_LAW => d_stored * ((stored.abs() + 0.055) / v / 2.4),
+        Transfer::Gamma22 if v > POWER_LAW => d_stored * (stored.abs() / v / 2.2),
+        _ => space.encode_pull(linear, d_stored),
+    }
 }
 
 fn compare(a: &Image, b: &Image, options: &PhotometricOptions, weight: f32) -> Result<PhotometricLoss, LossError> {
@@ -131,6 +170,25 @@ mod tests {
         assert!((half.value - 0.5 * one.value).abs() < 1e-7 && half.l1 == one.l1);
         for (g, h) in one.grad.data().iter().zip(half.grad.data()) {
             assert!((0.5 * g - h).abs() < 1e-7);
+        }
+    }
+
+    #[test]
+    fn an_encoded_photograph_is_the_same_and_the_short_slope_too() {
+        let a = Image::from_vec(4, 3, 3, (0..36).map(|i| (i as f32 * 0.7).sin().abs()).collect()).unwrap();
+        let b = a.map(|v| v * 0.5 + 0.1);
+        for space in [Transfer::Linear, Transfer::Srgb, Transfer::Gamma22] {
+            let options = PhotometricOptions { space, ..Default::default() };
+            let stored = space.encode_image(&b);
+            assert_eq!(
+                photometric(&a, &b, &options, 1.0).unwrap(),
+                photometric_encoded(&a, &stored, &options, 1.0).unwrap()
+            );
+            for v in [0.0, 1e-9, 0.003, 0.0039, 0.0041, -0.3, 0.5, 1.0, 80.0, 1e30, f32::MAX] {
+                let (short, long) = (encode_pull(space, v, space.encode(v), 1.5), space.encode_pull(v, 1.5));
+                // The exponents are rounded to f32, which a logarithm of 88 makes visible.
+                assert!((short - long).abs() <= 1e-5 * long, "{space:?} {v}: {short} {long}");
+            }
         }
     }
 

@@ -5,6 +5,80 @@ use crate::average::{coverage, finite, subgradient};
 use crate::error::{expect_image, expect_mask};
 use crate::{ImageLoss, LossError};
 
+/// How much each difference between neighbouring pixels counts, from the photograph and the mask: the part of
+/// [`smoothness`] that all maps of one view share.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EdgeWeights {
+    width: usize,
+    height: usize,
+    /// Weight of the pair (pixel, its right neighbour); 0 in the last column.
+    right: Vec<f32>,
+    /// Weight of the pair (pixel, its lower neighbour); 0 in the last row.
+    down: Vec<f32>,
+}
+
+impl EdgeWeights {
+    /// Weights under a `photograph` of 1 or 3 channels, inside `mask` (the same size; none is all pixels).
+    /// Errors: other sizes, other channel counts, NaN or infinity.
+    pub fn new(photograph: &Image, mask: Option<&Mask>) -> Result<Self, LossError> {
+        let (width, height, channels) = photograph.shape();
+        expect_image(photograph, (width, height), if channels == 3 { 3 } else { 1 }, "smoothness: photograph")?;
+        if let Some(mask) = mask {
+            expect_mask(mask, (width, height), "smoothness: mask")?;
+        }
+        let photo = photograph.data();
+        let weight = |p: usize, r: usize| {
+            let inside = coverage(mask, p) * coverage(mask, r);
+            if inside == 0.0 {
+                return 0.0;
+            }
+            let (i, j) = (p * channels, r * channels);
+            let edge: f64 = (0..channels).map(|c| (f64::from(photo[j + c]) - f64::from(photo[i + c])).abs()).sum();
+            inside * (-(edge / channels as f64) as f32).exp()
+        };
+        let (mut right, mut down) = (vec![0.0; width * height], vec![0.0; width * height]);
+        for y in 0..height {
+            for x in 0..width {
+                let p = y * width + x;
+                if x + 1 < width {
+                    right[p] = weight(p, p + 1);
+                }
+                if y + 1 < height {
+                    down[p] = weight(p, p + width);
+                }
+            }
+        }
+        Ok(Self { width, height, right, down })
+    }
+
+    /// `[eq:smoothness]` [`smoothness`] of `map` under these weights. Errors: another size, channels other than 1 or 3, NaN
+    /// or infinity.
+    pub fn smoothness(&self, map: &Image) -> Result<ImageLoss, LossError> {
+        let (width, height, channels) = map.shape();
+        expect_image(map, (self.width, self.height), if channels == 3 { 3 } else { 1 }, "smoothness: map")?;
+        let mut grad = Image::new(width, height, channels);
+        let scale = 1.0 / (map.pixels().max(1) * channels) as f64;
+        let mut sum = 0.0f64;
+        let (q, g) = (map.data(), grad.data_mut());
+        for (weights, stride) in [(&self.right, channels), (&self.down, width * channels)] {
+            for (p, &weight) in weights.iter().enumerate() {
+                if weight == 0.0 {
+                    continue;
+                }
+                let step = (f64::from(weight) * scale) as f32;
+                for i in p * channels..(p + 1) * channels {
+                    let d = f64::from(q[i + stride]) - f64::from(q[i]);
+                    sum += f64::from(weight) * d.abs();
+                    let step = step * subgradient(d as f32);
+                    g[i + stride] += step;
+                    g[i] -= step;
+                }
+            }
+        }
+        Ok(ImageLoss { value: finite(sum * scale), grad })
+    }
+}
+
 /// `[eq:smoothness]` Edge-aware smoothness of the rendered map q (1 or 3 channels) under the photograph I (1 or 3 channels,
 /// the same size, a constant): `mean(|∇q|·exp(−|∇I|)·M)`.
 ///
@@ -14,51 +88,10 @@ use crate::{ImageLoss, LossError};
 /// divided by the number of pixels. Both pixels must be inside the mask, so that the map is not drawn toward what lies
 /// outside the silhouette. The gradient (with respect to q) of |·| at 0 is 0.
 ///
-/// No mask means all pixels. Errors: other sizes, other channel counts, NaN or infinity.
+/// No mask means all pixels. For several maps of one view build the [`EdgeWeights`] once. Errors: other sizes, other
+/// channel counts, NaN or infinity.
 pub fn smoothness(map: &Image, photograph: &Image, mask: Option<&Mask>) -> Result<ImageLoss, LossError> {
-    let (width, height, channels) = map.shape();
-    let size = (width, height);
-    for (image, what) in [(map, "smoothness: map"), (photograph, "smoothness: photograph")] {
-        let channels = if image.channels() == 3 { 3 } else { 1 };
-        expect_image(image, size, channels, what)?;
-    }
-    if let Some(mask) = mask {
-        expect_mask(mask, size, "smoothness: mask")?;
-    }
-    let mut grad = Image::new(width, height, channels);
-    let scale = 1.0 / (map.pixels().max(1) * channels) as f64;
-    let mut sum = 0.0f64;
-    let (q, photo) = (map.data(), photograph.data());
-    let photo_channels = photograph.channels();
-    let mut pair = |p: usize, r: usize, g: &mut [f32]| {
-        let inside = coverage(mask, p) * coverage(mask, r);
-        if inside == 0.0 {
-            return;
-        }
-        let (i, j) = (p * photo_channels, r * photo_channels);
-        let edge: f64 = (0..photo_channels).map(|c| (f64::from(photo[j + c]) - f64::from(photo[i + c])).abs()).sum();
-        let weight = f64::from(inside) * f64::from((-(edge / photo_channels as f64) as f32).exp()) * scale;
-        for c in 0..channels {
-            let (i, j) = (p * channels + c, r * channels + c);
-            let d = f64::from(q[j]) - f64::from(q[i]);
-            sum += weight * d.abs();
-            let step = (weight as f32) * subgradient(d as f32);
-            g[j] += step;
-            g[i] -= step;
-        }
-    };
-    for y in 0..height {
-        for x in 0..width {
-            let p = y * width + x;
-            if x + 1 < width {
-                pair(p, p + 1, grad.data_mut());
-            }
-            if y + 1 < height {
-                pair(p, p + width, grad.data_mut());
-            }
-        }
-    }
-    Ok(ImageLoss { value: finite(sum), grad })
+    EdgeWeights::new(photograph, mask)?.smoothness(map)
 }
 
 #[cfg(test)]

@@ -172,7 +172,7 @@ impl Viewer {
         });
         let seen = (0..rgb.len())
             .map(|i| {
-                let rgb = self.primaries.from_opponent([blurred[0][i], blurred[1][i], blurred[2][i]]);
+                let rgb = self.primaries.rgb_of_opponent([blurred[0][i], blurred[1][i], blurred[2][i]]);
                 self.primaries.hunt_lab(rgb.map(|v| v.clamp(0.0, 1.0)))
             })
             .collect();

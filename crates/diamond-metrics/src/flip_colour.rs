@@ -50,7 +50,7 @@ impl Primaries {
     }
 
     /// The inverse of [`Primaries::opponent`].
-    pub fn from_opponent(&self, [luma, cx, cz]: Triple) -> Triple {
+    pub fn rgb_of_opponent(&self, [luma, cx, cz]: Triple) -> Triple {
         let y = achromatic(luma);
         multiply(&self.from_relative_xyz, [y + cx / 500.0, y, y - cz / 200.0])
     }
@@ -100,7 +100,7 @@ mod tests {
     fn the_opponent_space_goes_there_and_back() {
         let p = Primaries::srgb();
         for rgb in [[0.0, 0.0, 0.0], [1.0, 0.2, 0.7], [0.01, 0.99, 0.5]] {
-            let back = p.from_opponent(p.opponent(rgb));
+            let back = p.rgb_of_opponent(p.opponent(rgb));
             for c in 0..3 {
                 assert!((back[c] - rgb[c]).abs() < 1e-12);
             }

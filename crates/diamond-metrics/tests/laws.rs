@@ -108,6 +108,18 @@ proptest! {
     }
 }
 
+/// [eq:flip] [eq:flip-hdr] Flat images, for which flip-evaluator 1.7 gives these numbers.
+#[test]
+fn flip_of_flat_images() {
+    let flat = |v| Image::filled(20, 13, 3, v);
+    let ldr = |a, b, input| flip_ldr(&flat(a), &flat(b), FlipOptions { input, ..Default::default() }).unwrap().mean;
+    assert!((ldr(0.0, 1.0, FlipInput::Srgb) - 0.967_391).abs() < 1e-4);
+    assert!((ldr(0.5, 0.25, FlipInput::Srgb) - 0.569_090).abs() < 1e-4);
+    assert!((ldr(0.5, 0.25, FlipInput::Linear) - 0.451_897).abs() < 1e-4);
+    let hdr = flip_hdr(&flat(1.0), &flat(2.0), FlipHdrOptions::default()).unwrap();
+    assert!((hdr.flip.mean - 0.144_833).abs() < 1e-4 && hdr.exposures.count == 2);
+}
+
 #[test]
 fn wrong_inputs_are_errors_that_name_the_culprit() {
     let good = Image::filled(4, 3, 3, 0.5);

@@ -220,6 +220,7 @@ mod tests {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../assets/fixtures/metrics")
     }
 
+    /// [eq:psnr] [eq:ssim] [eq:flip] [eq:flip-hdr] [eq:flip-exposures]
     #[test]
     fn our_metrics_agree_with_the_goldens() {
         let report = check(&fixtures()).expect("the goldens can be read");
