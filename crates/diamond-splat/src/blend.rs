@@ -3,9 +3,10 @@
 //! Per block of 16 pixels and per batch of splats two phases alternate: first the weights `w = α·T` front to back, then
 //! `Σ w f` for four channels at a time with the sums in registers, which is a small matrix product and as fast as one.
 //! Depth is one more channel (the splat's z); opacity is the sum of the weights.
+use crate::Features;
 use crate::ellipse::{BLOCK, Ellipse, LANES, Prepared, TILE};
 use crate::lanes::{Block, Thresholds, alpha, any_positive, composite, load, store, with_lanes};
-use crate::tiles::{TileLists, entry_slot};
+use crate::tiles::{TileLists, entry_slot, tile_lists};
 use pulp::{Simd, WithSimd};
 
 /// Entries of a tile that are prepared and blended together.
@@ -17,9 +18,11 @@ pub(crate) const GROUP: usize = 4;
 pub(crate) struct Scene<'a> {
     /// By rank.
     pub ellipses: &'a [Ellipse],
-    /// Rows by rank: `channels` features, the depth, zeros up to `stride`.
-    pub features: &'a [f32],
-    /// A multiple of [`GROUP`] and of the vector width.
+    /// By rank: index of the Gaussian and depth.
+    pub sources: &'a [(u32, f32)],
+    /// By Gaussian.
+    pub features: &'a Features,
+    /// Of a row's own copy of the features; a multiple of [`GROUP`] and of the vector width.
     pub stride: usize,
     /// Without depth.
     pub channels: usize,
@@ -39,10 +42,9 @@ pub(crate) fn block_offsets(block: usize) -> ([f32; LANES], [f32; LANES]) {
 }
 
 impl Scene<'_> {
-    /// Centre of a tile, px.
-    pub fn centre(&self, tile: usize, row: usize) -> [f64; 2] {
-        let half = 0.5 * TILE as f64;
-        [(tile * TILE) as f64 + half, (row * TILE) as f64 + half]
+    /// x of a tile's centre, px.
+    pub fn centre(tile: usize) -> f64 {
+        (tile * TILE) as f64 + 0.5 * TILE as f64
     }
 
     /// Index of a lane's pixel within the row of tiles, `None` outside the image.
@@ -71,8 +73,6 @@ pub(crate) struct RowForward<'a> {
     pub row: usize,
     /// Slot → rank.
     pub ranks: &'a [u32],
-    /// Its `reach` is written.
-    pub lists: &'a mut TileLists,
     /// The row's pixels × channels.
     pub features: &'a mut [f32],
     /// The row's pixels.
@@ -91,10 +91,10 @@ pub(crate) struct RowWork {
 }
 
 impl WithSimd for RowForward<'_> {
-    type Output = RowWork;
+    type Output = (TileLists, RowWork);
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> RowWork {
+    fn with_simd<S: Simd>(self, s: S) -> (TileLists, RowWork) {
         if self.scene.smooth {
             with_lanes!(s: S, forward_row_smooth(self))
         } else {
@@ -104,31 +104,39 @@ impl WithSimd for RowForward<'_> {
 }
 
 #[inline(always)]
-fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> RowWork {
+fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (TileLists, RowWork) {
     forward_row::<S, N, false>(s, row)
 }
 
 #[inline(always)]
-fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> RowWork {
+fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (TileLists, RowWork) {
     forward_row::<S, N, true>(s, row)
 }
 
 #[inline(always)]
-fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForward) -> RowWork {
-    let RowForward { scene, row, ranks, lists, features, opacity, depth } = row;
+fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForward) -> (TileLists, RowWork) {
+    let RowForward { scene, row, ranks, features, opacity, depth } = row;
+    let mut lists = tile_lists(scene.ellipses, ranks, row, scene.width, scene.height);
+    lists.features = vec![0.0; ranks.len() * scene.stride];
+    for (to, &rank) in lists.features.chunks_exact_mut(scene.stride).zip(ranks) {
+        let (gaussian, depth) = scene.sources[rank as usize];
+        to[..scene.channels].copy_from_slice(scene.features.row(gaussian as usize));
+        to[scene.channels] = depth;
+    }
     let groups = scene.groups();
     let offsets: [_; 4] = std::array::from_fn(block_offsets);
     // Per block: transmittance, opacity, count of blended pairs, sums by channel.
     let mut t = [[0.0f32; LANES]; 4];
     let mut acc = vec![[0.0f32; LANES]; 4 * groups * GROUP];
     let mut prepared = [Prepared::default(); BATCH];
-    let mut batch_ranks = [0u32; BATCH];
+    // Where a splat's features begin.
+    let mut batch_rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
     let mut sources = [0u32; BATCH];
     let mut work = RowWork::default();
     for tile in 0..lists.reach.len() {
         let entries = &lists.entries[lists.start[tile] as usize..lists.start[tile + 1] as usize];
-        let centre = scene.centre(tile, row);
+        let centre = Scene::centre(tile);
         let reach = &mut lists.reach[tile];
         for block in 0..4 {
             t[block] = scene.initial_transmittance(tile, row, block);
@@ -142,9 +150,9 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
                 break;
             }
             for (k, &entry) in entries.iter().enumerate() {
-                let rank = ranks[entry_slot(entry)];
-                batch_ranks[k] = rank;
-                prepared[k] = scene.ellipses[rank as usize].prepare(centre);
+                let slot = entry_slot(entry);
+                batch_rows[k] = slot * scene.stride;
+                prepared[k] = lists.splats[slot].prepare(centre);
             }
             for block in 0..4 {
                 if open & 1 << block == 0 {
@@ -179,11 +187,14 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
                 // Phase 2: Σ w f.
                 for group in 0..groups {
                     let acc = &mut acc[(block * groups + group) * GROUP..][..GROUP];
-                    let mut sums: [Block<S, N>; GROUP] = std::array::from_fn(|c| load::<S, N>(&acc[c]));
+                    let mut sums: [Block<S, N>; GROUP] = [[s.splat_f32s(0.0); N]; GROUP];
+                    for c in 0..GROUP {
+                        sums[c] = load::<S, N>(&acc[c]);
+                    }
                     for m in 0..n {
                         let w = load::<S, N>(&weights[m]);
-                        let at = batch_ranks[sources[m] as usize] as usize * scene.stride + group * GROUP;
-                        let f = &scene.features[at..at + GROUP];
+                        let at = batch_rows[sources[m] as usize] + group * GROUP;
+                        let f = &lists.features[at..at + GROUP];
                         for c in 0..GROUP {
                             let f = s.splat_f32s(f[c]);
                             for i in 0..N {
@@ -212,5 +223,5 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
             }
         }
     }
-    work
+    (lists, work)
 }

@@ -50,6 +50,34 @@ pub(crate) struct Prepared {
     pub log2_opacity: f32,
 }
 
+/// A splat as one row of tiles needs it: small, because a row's worth of them should stay in the cache.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct RowSplat {
+    /// u at the row's centre line is `u_base + u_slope · x`, x in px. In f64, since the two terms cancel.
+    u_base: f64,
+    u_slope: f64,
+    v: f32,
+    u_x: f32,
+    u_y: f32,
+    v_y: f32,
+    log2_opacity: f32,
+}
+
+impl RowSplat {
+    /// The values at the tile whose centre has this x (px).
+    #[inline(always)]
+    pub fn prepare(&self, x: f64) -> Prepared {
+        Prepared {
+            u: (self.u_base + self.u_slope * x) as f32,
+            v: self.v,
+            u_x: self.u_x,
+            u_y: self.u_y,
+            v_y: self.v_y,
+            log2_opacity: self.log2_opacity,
+        }
+    }
+}
+
 impl Ellipse {
     pub fn new(s: &Splat) -> Self {
         let kappa = KAPPA2.sqrt();
@@ -70,14 +98,15 @@ impl Ellipse {
         }
     }
 
-    /// The values at a tile whose centre is `centre` (px).
+    /// The values for a row of tiles whose centre line is at `y` (px).
     #[inline(always)]
-    pub fn prepare(&self, centre: [f64; 2]) -> Prepared {
-        let (dx, dy) = (centre[0] - self.mean[0], centre[1] - self.mean[1]);
+    pub fn in_row(&self, y: f64) -> RowSplat {
+        let dy = y - self.mean[1];
         let [l11, l21, l22] = self.chol;
         let [u_x, u_y, v_y] = self.chol_f32;
-        Prepared {
-            u: (l11 * dx + l21 * dy) as f32,
+        RowSplat {
+            u_base: l21 * dy - l11 * self.mean[0],
+            u_slope: l11,
             v: (l22 * dy) as f32,
             u_x,
             u_y,
@@ -93,15 +122,15 @@ impl Ellipse {
         let [ex, ey] = self.extent;
         let low = ((y0 - self.mean[1]) as f32).max(-ey);
         let high = ((y1 - self.mean[1]) as f32).min(ey);
-        let row = |y: f32| {
-            let w = y * self.inv_sqrt_cov_yy;
-            (self.slope * y, self.half_width * (self.two_tau - w * w).max(0.0).sqrt())
-        };
-        let (right_centre, right) = row(self.y_of_rightmost.max(low).min(high));
-        let (left_centre, left) = row((-self.y_of_rightmost).max(low).min(high));
+        // The rightmost and the leftmost point of an ellipse's part in a band lie at the band's y nearest to theirs.
+        let right_y = self.y_of_rightmost.max(low).min(high);
+        let left_y = (-self.y_of_rightmost).max(low).min(high);
+        let (right_w, left_w) = (right_y * self.inv_sqrt_cov_yy, left_y * self.inv_sqrt_cov_yy);
+        let right = self.slope * right_y + self.half_width * (self.two_tau - right_w * right_w).max(0.0).sqrt();
+        let left = self.slope * left_y - self.half_width * (self.two_tau - left_w * left_w).max(0.0).sqrt();
         let slack = INTERVAL_SLACK.0 + INTERVAL_SLACK.1 * ex;
         let x = self.mean[0] as f32;
-        if low > high { (1.0, 0.0) } else { (x + left_centre - left - slack, x + right_centre + right + slack) }
+        if low > high { (1.0, 0.0) } else { (x + left - slack, x + right + slack) }
     }
 }
 

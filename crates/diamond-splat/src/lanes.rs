@@ -3,6 +3,9 @@
 //! A block of 4 × 4 pixels is `[S::f32s; N]` with N = 1 (AVX-512), 2 (AVX2), 4 (128-bit) or 16 (scalar). Fused
 //! multiply-adds are used where the hardware has them, so last bits differ between instruction sets but never between
 //! runs or numbers of threads on one machine.
+//!
+//! No vector operation may sit in a closure: a closure that is handed to a function of the standard library (such as
+//! `std::array::from_fn`) is compiled without the instruction set, and every operation in it becomes a call.
 use crate::ellipse::{LANES, Prepared};
 use pulp::Simd;
 
@@ -35,7 +38,9 @@ pub(crate) fn exp2<S: Simd>(s: S, t: S::f32s) -> S::f32s {
 #[inline(always)]
 pub(crate) fn load<S: Simd, const N: usize>(from: &[f32; LANES]) -> Block<S, N> {
     let (v, _) = S::as_simd_f32s(from);
-    std::array::from_fn(|i| v[i])
+    let mut block = [v[0]; N];
+    block.copy_from_slice(&v[..N]);
+    block
 }
 
 /// Stores sixteen values.
@@ -111,13 +116,15 @@ pub(crate) fn composite<S: Simd, const N: usize>(
 ) -> Block<S, N> {
     let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
     let stop = s.splat_f32s(limits.min_transmittance);
-    std::array::from_fn(|i| {
+    let mut weights = [zero; N];
+    for i in 0..N {
         let next = s.mul_f32s(t[i], s.sub_f32s(one, alpha[i]));
         let weight = s.mul_f32s(t[i], alpha[i]);
         let go = s.greater_than_f32s(next, stop);
         t[i] = s.select_f32s(go, next, zero);
-        s.select_f32s(go, weight, zero)
-    })
+        weights[i] = s.select_f32s(go, weight, zero);
+    }
+    weights
 }
 
 /// Whether any value is above 0.

@@ -10,7 +10,7 @@
 //! moments of the whitened offset `Lᵀd` in f64, where nothing cancels.
 use crate::blend::{Scene, block_offsets};
 use crate::ellipse::{LANES, Prepared};
-use crate::lanes::{Block, alpha, any_positive, composite, load, store, with_lanes};
+use crate::lanes::{alpha, any_positive, composite, load, store, with_lanes};
 use crate::tiles::{TileLists, entry_slot};
 use pulp::{Simd, WithSimd};
 
@@ -52,8 +52,6 @@ impl Moments {
 pub(crate) struct RowBackward<'a> {
     pub scene: &'a Scene<'a>,
     pub row: usize,
-    /// Slot → rank.
-    pub ranks: &'a [u32],
     pub lists: &'a TileLists,
     /// Cotangents of the row's pixels.
     pub d_features: &'a [f32],
@@ -103,10 +101,10 @@ const EMPTY: Pair = Pair { alpha: [0.0; LANES], transmittance: [0.0; LANES], cha
 
 #[inline(always)]
 fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackward) -> RowGrad {
-    let RowBackward { scene, row, ranks, lists, d_features, d_opacity, d_depth } = row;
+    let RowBackward { scene, row, lists, d_features, d_opacity, d_depth } = row;
     let (stride, channels) = (scene.stride, scene.channels);
-    let mut grad =
-        RowGrad { features: vec![0.0; ranks.len() * stride], moments: vec![Moments::default(); ranks.len()] };
+    let slots = lists.splats.len();
+    let mut grad = RowGrad { features: vec![0.0; slots * stride], moments: vec![Moments::default(); slots] };
     let offsets: [_; 4] = std::array::from_fn(block_offsets);
     let basis: Vec<[[f32; MOMENTS]; LANES]> = offsets.iter().map(moment_basis).collect();
     let mut prepared: Vec<Prepared> = Vec::new();
@@ -123,9 +121,11 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
             continue;
         }
         let entries = &lists.entries[lists.start[tile] as usize..][..used];
-        let centre = scene.centre(tile, row);
+        let centre = Scene::centre(tile);
         prepared.clear();
-        prepared.extend(entries.iter().map(|&e| scene.ellipses[ranks[entry_slot(e)] as usize].prepare(centre)));
+        for &entry in entries {
+            prepared.push(lists.splats[entry_slot(entry)].prepare(centre));
+        }
         tile_moments.clear();
         tile_moments.resize(used, [0.0; MOMENTS]);
         for block in 0..4 {
@@ -160,15 +160,17 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 let before = t;
                 let (a, chain) = alpha::<S, N, SMOOTH>(s, &prepared[k], &x, &y, &scene.limits);
                 let w = composite::<S, N>(s, &a, &mut t, &scene.limits);
-                // Lanes that have stopped carry T = 0 from here on, so that all their products vanish.
-                let pair = &mut pairs[n];
+                // Lanes that have stopped carry α = T = 0 from here on, so that all their products vanish.
                 let zero = s.splat_f32s(0.0);
-                let counts: Block<S, N> =
-                    std::array::from_fn(|i| s.select_f32s(s.greater_than_f32s(w[i], zero), before[i], zero));
-                let a: Block<S, N> =
-                    std::array::from_fn(|i| s.select_f32s(s.greater_than_f32s(w[i], zero), a[i], zero));
+                let (mut a, mut t_before) = (a, before);
+                for i in 0..N {
+                    let counts = s.greater_than_f32s(w[i], zero);
+                    a[i] = s.select_f32s(counts, a[i], zero);
+                    t_before[i] = s.select_f32s(counts, before[i], zero);
+                }
+                let pair = &mut pairs[n];
                 store::<S, N>(&mut pair.alpha, a);
-                store::<S, N>(&mut pair.transmittance, counts);
+                store::<S, N>(&mut pair.transmittance, t_before);
                 store::<S, N>(&mut pair.chain, chain);
                 sources[n] = k as u32;
                 n += any_positive::<S, N>(s, &w) as usize;
@@ -179,11 +181,13 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
             let mut end = n;
             while end > 0 {
                 let begin = end.saturating_sub(GROUP);
-                // In a short group the first splat stands in for the missing ones; their results are not used.
-                let at: [usize; GROUP] = std::array::from_fn(|m| (begin + m).min(end - 1));
-                let slots: [usize; GROUP] = at.map(|p| entry_slot(entries[sources[p] as usize]));
-                let rows: [&[f32]; GROUP] =
-                    slots.map(|slot| &scene.features[ranks[slot] as usize * stride..][..channels + 1]);
+                // In a short group the last splat stands in for the missing ones; their results are not used.
+                let mut slots = [0usize; GROUP];
+                let mut rows: [&[f32]; GROUP] = [&[]; GROUP];
+                for m in 0..GROUP {
+                    slots[m] = entry_slot(entries[sources[(begin + m).min(end - 1)] as usize]);
+                    rows[m] = &lists.features[slots[m] * stride..][..channels + 1];
+                }
                 let mut e = [d_one; GROUP];
                 for c in 0..=channels {
                     let d = load::<S, N>(&by_channel[c]);
@@ -212,20 +216,39 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                     store::<S, N>(&mut w[m], w_m);
                     store::<S, N>(&mut g[m], g_m);
                 }
-                // Σ over pixels of g·basis and w·dC.
-                let width = S::F32_LANES.max(8);
-                accumulate::<S>(s, &g, basis[block].as_flattened(), MOMENTS, 0, width, |m, c, v| {
-                    if m < end - begin {
+                // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
+                let mut c = 0;
+                while c < 8 {
+                    let sums = product::<S, 1>(s, &g, &basis[block].as_flattened()[c..], MOMENTS);
+                    for m in 0..end - begin {
                         let to = &mut tile_moments[sources[begin + m] as usize];
-                        add::<S>(s, &mut to[c..c + S::F32_LANES], v);
+                        add::<S>(s, &mut to[c..c + S::F32_LANES], sums[m][0]);
                     }
-                });
-                accumulate::<S>(s, &w, &by_pixel, stride, 0, stride, |m, c, v| {
-                    if m < end - begin {
+                    c += S::F32_LANES;
+                }
+                let mut c = 0;
+                while c < stride {
+                    let two = c + 2 * S::F32_LANES <= stride;
+                    let sums = if two {
+                        product::<S, 2>(s, &w, &by_pixel[c..], stride)
+                    } else {
+                        let one = product::<S, 1>(s, &w, &by_pixel[c..], stride);
+                        let mut sums = [[s.splat_f32s(0.0); 2]; GROUP];
+                        for m in 0..GROUP {
+                            sums[m][0] = one[m][0];
+                        }
+                        sums
+                    };
+                    for m in 0..end - begin {
                         let to = slots[m] * stride + c;
-                        add::<S>(s, &mut grad.features[to..to + S::F32_LANES], v);
+                        add::<S>(s, &mut grad.features[to..to + S::F32_LANES], sums[m][0]);
+                        if two {
+                            let to = to + S::F32_LANES;
+                            add::<S>(s, &mut grad.features[to..to + S::F32_LANES], sums[m][1]);
+                        }
                     }
-                });
+                    c += if two { 2 } else { 1 } * S::F32_LANES;
+                }
                 end = begin;
             }
         }
@@ -252,45 +275,23 @@ fn add<S: Simd>(s: S, to: &mut [f32], v: S::f32s) {
     to[0] = s.add_f32s(to[0], v);
 }
 
-/// `out(m, c, Σ_lane left[m][lane] · right[lane][c..])` for columns `first..past`, a vector of columns at a time.
+/// `Σ_lane left[m][lane] · right[lane · stride..]` for V vectors of columns.
 #[inline(always)]
-fn accumulate<S: Simd>(
+fn product<S: Simd, const V: usize>(
     s: S,
     left: &[[f32; LANES]; GROUP],
     right: &[f32],
     stride: usize,
-    first: usize,
-    past: usize,
-    mut out: impl FnMut(usize, usize, S::f32s),
-) {
-    let mut c = first;
-    while c + 2 * S::F32_LANES <= past {
-        let mut sums = [[s.splat_f32s(0.0); 2]; GROUP];
-        for lane in 0..LANES {
-            let (r, _) = S::as_simd_f32s(&right[lane * stride + c..][..2 * S::F32_LANES]);
-            for m in 0..GROUP {
-                let l = s.splat_f32s(left[m][lane]);
-                sums[m][0] = s.mul_add_e_f32s(l, r[0], sums[m][0]);
-                sums[m][1] = s.mul_add_e_f32s(l, r[1], sums[m][1]);
+) -> [[S::f32s; V]; GROUP] {
+    let mut sums = [[s.splat_f32s(0.0); V]; GROUP];
+    for lane in 0..LANES {
+        let (r, _) = S::as_simd_f32s(&right[lane * stride..][..V * S::F32_LANES]);
+        for m in 0..GROUP {
+            let l = s.splat_f32s(left[m][lane]);
+            for v in 0..V {
+                sums[m][v] = s.mul_add_e_f32s(l, r[v], sums[m][v]);
             }
         }
-        for m in 0..GROUP {
-            out(m, c, sums[m][0]);
-            out(m, c + S::F32_LANES, sums[m][1]);
-        }
-        c += 2 * S::F32_LANES;
     }
-    while c < past {
-        let mut sums = [s.splat_f32s(0.0); GROUP];
-        for lane in 0..LANES {
-            let (r, _) = S::as_simd_f32s(&right[lane * stride + c..][..S::F32_LANES]);
-            for m in 0..GROUP {
-                sums[m] = s.mul_add_e_f32s(s.splat_f32s(left[m][lane]), r[0], sums[m]);
-            }
-        }
-        for m in 0..GROUP {
-            out(m, c, sums[m]);
-        }
-        c += S::F32_LANES;
-    }
+    sums
 }

@@ -4,11 +4,11 @@ use crate::ellipse::{KAPPA2, TILE};
 use crate::lanes::{Thresholds, vector_width};
 use crate::projection::{FootprintGrad, View, finite_f32, is_smooth, project, project_pull};
 use crate::pullback::{Moments, RowBackward, RowGrad};
-use crate::tiles::{Rows, TileLists, assign_rows, tile_lists};
+use crate::tiles::{Rows, TileLists, assign_rows};
 use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
-use glam::{Vec2, Vec3, Vec4};
+use glam::Vec2;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -65,17 +65,9 @@ impl RasterGrad {
 pub struct RasterPullback<'a> {
     gaussians: &'a Gaussians,
     projection: Cow<'a, Projection>,
-    channels: usize,
+    features: &'a Features,
     rows: Rows,
     lists: Vec<TileLists>,
-    packed: Packed,
-}
-
-/// Features and depth by rank, padded.
-#[derive(Debug)]
-struct Packed {
-    stride: usize,
-    data: Vec<f32>,
 }
 
 /// Projects and blends `[eq:splat-blend]`.
@@ -108,7 +100,7 @@ struct Packed {
 /// ```
 pub fn rasterize<'a>(
     gaussians: &'a Gaussians,
-    features: &Features,
+    features: &'a Features,
     camera: &Camera,
     config: &RasterConfig,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
@@ -125,7 +117,7 @@ pub fn rasterize<'a>(
 pub fn rasterize_projected<'a>(
     projection: &'a Projection,
     gaussians: &'a Gaussians,
-    features: &Features,
+    features: &'a Features,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     blend(Cow::Borrowed(projection), gaussians, features)
 }
@@ -133,7 +125,7 @@ pub fn rasterize_projected<'a>(
 fn blend<'a>(
     projection: Cow<'a, Projection>,
     gaussians: &'a Gaussians,
-    features: &Features,
+    features: &'a Features,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let n = gaussians.len();
     if projection.radii().len() != n {
@@ -151,7 +143,6 @@ fn blend<'a>(
         return Err(SplatError::NonFinite { what: "Features::data (row of Gaussian)", index: i as usize });
     }
     let rows = assign_rows(&projection);
-    let packed = pack(&projection, &rows, features);
     let k = &projection.camera.intrinsics;
     let (width, height) = (k.width as usize, k.height as usize);
     let mut raster = Raster {
@@ -160,7 +151,7 @@ fn blend<'a>(
         depth: Image::new(width, height, 1),
         stats: RasterStats { visible: rows.order.len(), ..Default::default() },
     };
-    let scene = scene(&projection, &rows, &packed, channels);
+    let scene = scene(&projection, &rows, features);
     let band = width * TILE;
     // Zero channels: every row gets an empty piece.
     let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
@@ -175,26 +166,24 @@ fn blend<'a>(
         .enumerate()
         .map(|(row, ((features, opacity), depth))| {
             let ranks = &rows.slot_rank[rows.row_start[row]..rows.row_start[row + 1]];
-            let mut lists = tile_lists(&rows.ellipses, ranks, row, width, height);
-            let forward = RowForward { scene: &scene, row, ranks, lists: &mut lists, features, opacity, depth };
-            let work = pulp::Arch::new().dispatch(forward);
-            (lists, work)
+            pulp::Arch::new().dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
         })
         .unzip();
     raster.stats.tile_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
     raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
     raster.stats.blended_pairs = works.iter().map(|w| w.blended).sum();
-    Ok((raster, RasterPullback { gaussians, projection, channels, rows, lists, packed }))
+    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists }))
 }
 
-fn scene<'a>(projection: &Projection, rows: &'a Rows, packed: &'a Packed, channels: usize) -> Scene<'a> {
+fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
         ellipses: &rows.ellipses,
-        features: &packed.data,
-        stride: packed.stride,
-        channels,
+        sources: &rows.sources,
+        features,
+        stride: stride(features.channels),
+        channels: features.channels,
         limits: Thresholds {
             min_alpha: config.min_alpha,
             max_alpha: config.max_alpha,
@@ -206,16 +195,9 @@ fn scene<'a>(projection: &Projection, rows: &'a Rows, packed: &'a Packed, channe
     }
 }
 
-fn pack(projection: &Projection, rows: &Rows, features: &Features) -> Packed {
-    let channels = features.channels;
-    let stride = (channels + 1).next_multiple_of(vector_width().max(2 * GROUP));
-    let mut data = vec![0.0; rows.order.len() * stride];
-    data.par_chunks_mut(stride).with_min_len(1024).zip(&rows.order).for_each(|(to, &i)| {
-        let splat = &projection.splats[i as usize];
-        to[..channels].copy_from_slice(features.row(splat.gaussian as usize));
-        to[channels] = splat.depth;
-    });
-    Packed { stride, data }
+/// Values per splat in a row's copy of the features.
+fn stride(channels: usize) -> usize {
+    (channels + 1).next_multiple_of(vector_width().max(2 * GROUP))
 }
 
 impl RasterPullback<'_> {
@@ -231,10 +213,10 @@ impl RasterPullback<'_> {
     pub fn pull(&self, d: &RasterGrad) -> Result<RasterPull, SplatError> {
         let k = &self.projection.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        check(&d.features, (width, height, self.channels), "RasterGrad::features")?;
+        check(&d.features, (width, height, self.features.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
-        let scene = scene(&self.projection, &self.rows, &self.packed, self.channels);
+        let scene = scene(&self.projection, &self.rows, self.features);
         let rows: Vec<RowGrad> = self
             .lists
             .par_iter()
@@ -244,9 +226,9 @@ impl RasterPullback<'_> {
                 pulp::Arch::new().dispatch(RowBackward {
                     scene: &scene,
                     row,
-                    ranks: &self.rows.slot_rank[self.rows.row_start[row]..self.rows.row_start[row + 1]],
                     lists,
-                    d_features: &d.features.data()[pixels.start * self.channels..pixels.end * self.channels],
+                    d_features: &d.features.data()
+                        [pixels.start * self.features.channels..pixels.end * self.features.channels],
                     d_opacity: &d.opacity.data()[pixels.clone()],
                     d_depth: &d.depth.data()[pixels],
                 })
@@ -255,73 +237,67 @@ impl RasterPullback<'_> {
         Ok(self.gather(&rows))
     }
 
-    /// Sums the rows' contributions per Gaussian, in order of rows, and pulls them through the projection.
+    /// Sums the rows' contributions per splat, in order of rows, and pulls them through the projection.
     fn gather(&self, parts: &[RowGrad]) -> RasterPull {
         let n = self.gaussians.len();
-        let (channels, stride) = (self.channels, self.packed.stride);
+        let channels = self.features.channels;
+        let stride = stride(channels);
+        let splats = &self.projection.splats;
+        // By rank first: consecutive ranks read consecutive slots of every row.
+        let mut features = vec![0.0f32; splats.len() * stride];
+        let mut moments = vec![Moments::default(); splats.len()];
+        features
+            .par_chunks_mut(stride)
+            .zip(&mut moments)
+            .with_min_len(512)
+            .enumerate()
+            .for_each(|(rank, (features, moments))| self.sum_rows(rank, parts, features, moments));
         let mut rank_of = vec![u32::MAX; n];
         for (rank, &i) in self.rows.order.iter().enumerate() {
-            rank_of[self.projection.splats[i as usize].gaussian as usize] = rank as u32;
+            rank_of[splats[i as usize].gaussian as usize] = rank as u32;
         }
+        // Then by Gaussian.
         let view = View::new(&self.projection.camera);
-        let mut pull = RasterPull {
-            gaussians: GaussiansGrad::zeros(n),
-            features: vec![0.0; n * channels],
-            screen: vec![Vec2::ZERO; n],
-        };
-        let g = &mut pull.gaussians;
-        let mut unused = vec![[0.0f32; 0]; if channels == 0 { n } else { 0 }];
-        let feature_rows: Vec<&mut [f32]> = if channels == 0 {
-            unused.iter_mut().map(|v| v.as_mut_slice()).collect()
-        } else {
-            pull.features.chunks_mut(channels).collect()
-        };
-        (g.means.par_iter_mut(), g.scales.par_iter_mut(), g.rotations.par_iter_mut(), g.opacities.par_iter_mut())
+        let mut d_features = vec![0.0; n * channels];
+        if channels > 0 {
+            d_features.par_chunks_mut(channels).zip(&rank_of).with_min_len(1024).for_each(|(to, &rank)| {
+                if rank != u32::MAX {
+                    to.copy_from_slice(&features[rank as usize * stride..][..channels]);
+                }
+            });
+        }
+        let mut g = GaussiansGrad::zeros(n);
+        let mut screen = vec![Vec2::ZERO; n];
+        (&mut g.means, &mut g.scales, &mut g.rotations, &mut g.opacities, &mut screen, &rank_of)
             .into_par_iter()
-            .zip(feature_rows)
-            .zip(&mut pull.screen)
             .enumerate()
             .with_min_len(256)
-            .for_each(|(i, (((mean, scale, rotation, opacity), features), screen))| {
-                let rank = rank_of[i];
+            .for_each(|(i, (mean, scale, rotation, opacity, screen, &rank))| {
                 if rank == u32::MAX {
                     return;
                 }
-                let one = self.gather_one(i, rank as usize, parts, stride, &view, features);
-                (*mean, *scale, *rotation, *opacity, *screen) = one;
+                let splat = &splats[self.rows.order[rank as usize] as usize];
+                let sum = &moments[rank as usize];
+                let d_depth = features[rank as usize * stride + channels] as f64;
+                let footprint = sum.footprint_grad(splat.chol, d_depth);
+                let d = project_pull(self.gaussians, i, &view, &footprint);
+                (*mean, *scale, *rotation) = (d.mean, d.scale, d.rotation);
+                *opacity = finite_f32(sum.one / splat.opacity as f64);
+                *screen = Vec2::from_array(footprint.mean.map(finite_f32));
             });
-        pull
+        RasterPull { gaussians: g, features: d_features, screen }
     }
 
-    fn gather_one(
-        &self,
-        gaussian: usize,
-        rank: usize,
-        parts: &[RowGrad],
-        stride: usize,
-        view: &View,
-        features: &mut [f32],
-    ) -> (Vec3, Vec3, Vec4, f32, Vec2) {
+    fn sum_rows(&self, rank: usize, parts: &[RowGrad], features: &mut [f32], moments: &mut Moments) {
         let splat = &self.projection.splats[self.rows.order[rank] as usize];
-        let height = self.projection.camera.intrinsics.height;
-        let first_row = splat.pixel_rows(height).0 as usize / TILE;
-        let mut sum = Moments::default();
-        let mut d_depth = 0.0;
+        let first_row = splat.pixel_rows(self.projection.camera.intrinsics.height).0 as usize / TILE;
         let slots = &self.rows.rank_slots[self.rows.rank_start[rank]..self.rows.rank_start[rank + 1]];
-        for (k, &slot) in slots.iter().enumerate() {
-            let row = first_row + k;
+        for (row, &slot) in (first_row..).zip(slots) {
             let slot = slot as usize - self.rows.row_start[row];
-            let part = &parts[row];
-            sum.add(&part.moments[slot]);
-            let line = &part.features[slot * stride..][..stride];
+            moments.add(&parts[row].moments[slot]);
+            let line = &parts[row].features[slot * features.len()..][..features.len()];
             features.iter_mut().zip(line).for_each(|(a, b)| *a += b);
-            d_depth += line[self.channels] as f64;
         }
-        let footprint = sum.footprint_grad(splat.chol, d_depth);
-        let d = project_pull(self.gaussians, gaussian, view, &footprint);
-        let d_opacity = finite_f32(sum.one / splat.opacity as f64);
-        let screen = Vec2::from_array(footprint.mean.map(finite_f32));
-        (d.mean, d.scale, d.rotation, d_opacity, screen)
     }
 }
 
@@ -350,8 +326,12 @@ fn check(image: &Image, shape: (usize, usize, usize), what: &'static str) -> Res
     if image.shape() != shape {
         return Err(SplatError::Shape { what, expected: format!("{shape:?}"), found: format!("{:?}", image.shape()) });
     }
-    match image.data().iter().position(|v| !v.is_finite()) {
-        Some(index) => Err(SplatError::NonFinite { what, index }),
-        None => Ok(()),
+    // Infinity and NaN have the largest exponents. A maximum of integers is something that compilers vectorise.
+    let largest = image.data().iter().fold(0u32, |m, v| m.max(v.to_bits() & 0x7FFF_FFFF));
+    let finite = f32::from_bits(largest).is_finite();
+    if finite {
+        return Ok(());
     }
+    let index = image.data().iter().position(|v| !v.is_finite()).unwrap_or(0);
+    Err(SplatError::NonFinite { what, index })
 }

@@ -4,7 +4,7 @@
 //! parallel without sharing anything. Splats are sorted by view-space z once (ties by index); each row keeps its
 //! splats in that order, and each tile of the row keeps the slots of the splats whose ellipse meets it, with four bits
 //! that say which of its 4 × 4 blocks.
-use crate::ellipse::{BLOCK, Ellipse, TILE};
+use crate::ellipse::{BLOCK, Ellipse, RowSplat, TILE};
 use crate::projection::Projection;
 use rayon::prelude::*;
 
@@ -18,6 +18,8 @@ pub(crate) struct Rows {
     pub order: Vec<u32>,
     /// By rank.
     pub ellipses: Vec<Ellipse>,
+    /// By rank: index of the Gaussian and view-space z.
+    pub sources: Vec<(u32, f32)>,
     /// Slots of row `r` are `row_start[r]..row_start[r + 1]`.
     pub row_start: Vec<usize>,
     /// Slot → rank.
@@ -49,6 +51,7 @@ pub(crate) fn assign_rows(projection: &Projection) -> Rows {
             (Ellipse::new(s), (y0 / TILE as u32, y1.div_ceil(TILE as u32)))
         })
         .unzip();
+    let sources = order.iter().map(|&i| (splats[i as usize].gaussian, splats[i as usize].depth)).collect();
     let rows = (height as usize).div_ceil(TILE);
     let mut row_start = vec![0usize; rows + 1];
     let mut rank_start = Vec::with_capacity(spans.len() + 1);
@@ -70,12 +73,17 @@ pub(crate) fn assign_rows(projection: &Projection) -> Rows {
             next[r] += 1;
         }
     }
-    Rows { order, ellipses, row_start, slot_rank, rank_start, rank_slots }
+    Rows { order, ellipses, sources, row_start, slot_rank, rank_start, rank_slots }
 }
 
 /// The lists of the tiles of one row.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct TileLists {
+    /// By slot.
+    pub splats: Vec<RowSplat>,
+    /// By slot: the features, the depth, zeros up to the scene's stride. A copy of one's own for every row, because a
+    /// row's worth fits in the cache and the features of all splats do not.
+    pub features: Vec<f32>,
     /// Entries of tile `t` are `start[t]..start[t + 1]`.
     pub start: Vec<u32>,
     /// `slot within the row << 4 | block bits`, in depth order.
@@ -90,45 +98,58 @@ pub(crate) fn entry_slot(entry: u32) -> usize {
     (entry >> 4) as usize
 }
 
-/// Builds the lists of row `row` for its splats `ranks`.
+/// Builds the lists of row `row` for its splats `ranks`. To be called where the vector instruction set is enabled: it
+/// has roots and roundings in it.
+#[inline(always)]
 pub(crate) fn tile_lists(ellipses: &[Ellipse], ranks: &[u32], row: usize, width: usize, height: usize) -> TileLists {
     let tiles = width.div_ceil(TILE);
-    let blocks = width.div_ceil(BLOCK);
+    let blocks = width.div_ceil(BLOCK) as f32;
+    let top = row * TILE;
+    let middle = top + BLOCK;
+    let bottom = (top + TILE).min(height);
+    // The bands' pixel centres.
+    let upper = (top as f64 + 0.5, middle.min(height) as f64 - 0.5);
+    let lower = (middle as f64 + 0.5, bottom as f64 - 0.5);
+    let mut lists = TileLists { reach: vec![[0; 4]; tiles], ..Default::default() };
     let mut counts = vec![0u32; tiles + 1];
     // Blocks (first, one past last) of the upper and the lower band.
-    let spans: Vec<[u16; 4]> = ranks
-        .iter()
-        .map(|&rank| {
-            let ellipse = &ellipses[rank as usize];
-            let mut span = [0u16; 4];
-            for band in 0..2 {
-                let y = row * TILE + band * BLOCK;
-                if y < height {
-                    let last = (y + BLOCK).min(height);
-                    let (lo, hi) = ellipse.band(y as f64 + 0.5, last as f64 - 0.5);
-                    // A block's pixel centres are 4b + 0.5 … 4b + 3.5. `as` saturates.
-                    let first = ((lo - 3.5) * 0.25).ceil() as u32;
-                    let past = ((((hi - 0.5) * 0.25).floor() + 1.0) as u32).min(blocks as u32);
-                    if lo <= hi && first < past {
-                        span[2 * band] = first as u16;
-                        span[2 * band + 1] = past as u16;
-                    }
-                }
-            }
-            for_each_tile(span, |tile, _| counts[tile + 1] += 1);
-            span
-        })
-        .collect();
-    (0..tiles).for_each(|t| counts[t + 1] += counts[t]);
+    let mut spans: Vec<[u16; 4]> = Vec::with_capacity(ranks.len());
+    lists.splats.reserve(ranks.len());
+    // Gathered first, by a loop that does nothing else, so that many cache misses are under way at once.
+    let mut gathered = Vec::with_capacity(ranks.len());
+    for &rank in ranks {
+        gathered.push(ellipses[rank as usize]);
+    }
+    for ellipse in &gathered {
+        lists.splats.push(ellipse.in_row(middle as f64));
+        let a = block_span(ellipse.band(upper.0, upper.1), blocks);
+        let b = if middle < bottom { block_span(ellipse.band(lower.0, lower.1), blocks) } else { (0, 0) };
+        let span = [a.0, a.1, b.0, b.1];
+        for_each_tile(span, |tile, _| counts[tile + 1] += 1);
+        spans.push(span);
+    }
+    for t in 0..tiles {
+        counts[t + 1] += counts[t];
+    }
     let mut next = counts.clone();
-    let mut entries = vec![0u32; counts[tiles] as usize];
+    lists.entries = vec![0; counts[tiles] as usize];
     for (slot, &span) in spans.iter().enumerate() {
         for_each_tile(span, |tile, mask| {
-            entries[next[tile] as usize] = (slot as u32) << 4 | mask;
+            lists.entries[next[tile] as usize] = (slot as u32) << 4 | mask;
             next[tile] += 1;
         });
     }
-    TileLists { start: counts, entries, reach: vec![[0; 4]; tiles] }
+    lists.start = counts;
+    lists
+}
+
+/// The blocks (first, one past last) that have a pixel centre between `low` and `high` (px). A block's outer pixel
+/// centres are at 4b + 0.5 and 4b + 3.5; conversion to integers rounds toward zero.
+#[inline(always)]
+fn block_span((low, high): (f32, f32), blocks: f32) -> (u16, u16) {
+    let first = ((low + 0.5) * 0.25).max(0.0).min(blocks) as i32;
+    let past = ((high + 3.5) * 0.25).max(0.0).min(blocks) as i32;
+    if low > high { (0, 0) } else { (first as u16, past as u16) }
 }
 
 /// Calls `f(tile, block bits)` for every tile that has a block in one of the two spans.
