@@ -101,7 +101,7 @@ pub(crate) fn dispatch<K: Kernel>(kernel: K) {
         type Output = ();
         #[inline(always)]
         fn with_simd<S: pulp::Simd>(self, simd: S) {
-            if S::IS_SCALAR || ROW_ALIGNMENT % S::F32_LANES != 0 {
+            if S::IS_SCALAR || !ROW_ALIGNMENT.is_multiple_of(S::F32_LANES) {
                 self.0.run(Plain)
             } else {
                 self.0.run(Vectors(simd))
@@ -228,17 +228,12 @@ fn tile<L: Lanes, const TRANSPOSE_A: bool, const M: usize, const N: usize>(
     if let Some(init) = s.row_init {
         let init = &init[v..v + N];
         for m in 0..M {
-            for n in 0..N {
-                acc[m][n] = init[n];
-            }
+            acc[m].copy_from_slice(init);
         }
     }
     if s.accumulate {
         for m in 0..M {
-            let line = &c[m * c_stride + v..][..N];
-            for n in 0..N {
-                acc[m][n] = line[n];
-            }
+            acc[m].copy_from_slice(&c[m * c_stride + v..][..N]);
         }
     }
     if TRANSPOSE_A {
@@ -268,10 +263,7 @@ fn tile<L: Lanes, const TRANSPOSE_A: bool, const M: usize, const N: usize>(
         }
     }
     for m in 0..M {
-        let line = &mut c[m * c_stride + v..][..N];
-        for n in 0..N {
-            line[n] = acc[m][n];
-        }
+        c[m * c_stride + v..][..N].copy_from_slice(&acc[m]);
     }
 }
 

@@ -1,5 +1,5 @@
 //! The dense network against the dual-number oracle, its determinism, and that it learns.
-use diamond_shading::{Activation, CHUNK_ROWS, GRADIENT_GROUPS, Mlp, MlpShape, ShadingError};
+use diamond_shading::{Activation, CHUNK_ROWS, Mlp, MlpShape, ShadingError};
 use diamond_testkit::adjoint::{adjoint_gap, relative_l2};
 use diamond_testkit::mlp::{Nonlinearity, dense_network};
 use diamond_testkit::{Dual, jvp, vjp};
@@ -163,7 +163,7 @@ fn rows_are_independent_of_their_batch() {
 #[cfg(feature = "parallel")]
 #[test]
 fn the_number_of_threads_does_not_change_a_bit() {
-    let batch = CHUNK_ROWS * GRADIENT_GROUPS * 2 + 17;
+    let batch = CHUNK_ROWS * diamond_shading::GRADIENT_GROUPS * 2 + 17;
     let mlp = network(&[42, 64, 64, 3], Activation::Relu, Activation::Sigmoid, 8);
     let (inputs, d_outputs) = (numbers(batch * 42, 9), numbers(batch * 3, 10));
     let run = |threads: usize| {
