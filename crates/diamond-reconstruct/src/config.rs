@@ -403,8 +403,11 @@ impl Config {
             return Self::preset(preset_or_path);
         }
         let path = Path::new(preset_or_path);
-        let text = std::fs::read_to_string(path)
-            .map_err(|e| ReconstructError::Io { path: path.to_owned(), action: "read the configuration", source: e })?;
+        let text = std::fs::read_to_string(path).map_err(|e| ReconstructError::Io {
+            path: path.to_owned(),
+            action: "read the configuration",
+            source: e,
+        })?;
         Self::parse(&text, preset_or_path)
     }
 
@@ -464,7 +467,10 @@ impl Config {
             }
         }
         if self.initial.opacity <= 0.0 || self.initial.opacity >= 1.0 {
-            return fail(format!("`initial.opacity` must lie strictly between 0 and 1, found {}", self.initial.opacity));
+            return fail(format!(
+                "`initial.opacity` must lie strictly between 0 and 1, found {}",
+                self.initial.opacity
+            ));
         }
         if let Some(degree) = self.residual.transfer_degree.filter(|d| *d > 3) {
             return fail(format!("`residual.transfer_degree` must be at most 3, found {degree}"));
@@ -482,6 +488,27 @@ impl Config {
             ("visibility", self.loss.visibility),
             ("lpips", self.loss.lpips),
         ];
+        let r = &self.rates;
+        let rates = [
+            ("mean", r.mean),
+            ("mean_final", r.mean_final),
+            ("scale", r.scale),
+            ("rotation", r.rotation),
+            ("opacity", r.opacity),
+            ("normal", r.normal),
+            ("material", r.material),
+            ("visibility_sh", r.visibility_sh),
+            ("transfer", r.transfer),
+            ("codes", r.codes),
+            ("network", r.network),
+            ("network_final", r.network_final),
+            ("attribute_final", r.attribute_final),
+        ];
+        for (key, value) in rates {
+            if !value.is_finite() || value < 0.0 {
+                return fail(format!("`rates.{key}` must be finite and not negative, found {value}"));
+            }
+        }
         for (key, value) in losses {
             if !value.is_finite() || value < 0.0 {
                 return fail(format!("`loss.{key}` must be finite and not negative, found {value}"));

@@ -6,8 +6,8 @@ use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
-    Activated, ActivatedGrad, Attribute, Engine, Model, ReconstructError, Rendering, StepPlan, StepReport, TensorFile,
-    TrainingPair, adam, error, logit,
+    Activated, ActivatedGrad, Attribute, Engine, GaussianParameters, Model, ReconstructError, Rendering, StepPlan,
+    StepReport, TensorFile, TrainingPair, adam, error, logit,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
@@ -46,25 +46,26 @@ impl Profile {
     }
 }
 
+/// Stops at the first gradient that is not finite, and names it.
+fn check_gradients(parameters: &GaussianParameters, gradients: &[Vec<f32>], step: u64) -> Result<(), ReconstructError> {
+    for (attribute, gradient) in Attribute::ALL.iter().zip(gradients) {
+        if let Some(i) = gradient.iter().position(|g| !g.is_finite()) {
+            let width = parameters.group(*attribute).width.max(1);
+            return Err(ReconstructError::NonFinite {
+                what: format!("the gradient of `{}`", attribute.name()),
+                step,
+                detail: format!("Gaussian {}, component {}: {}", i / width, i % width, gradient[i]),
+            });
+        }
+    }
+    Ok(())
+}
+
 impl CpuEngine {
     /// An engine that trains `model` further.
     pub fn new(model: Model) -> Self {
         let stats = DensityStats::new(model.len());
         Self { model, visibility: VisibilityCache::default(), stats, profile: Profile::default() }
-    }
-
-    fn check_gradients(&self, gradients: &[Vec<f32>], step: u64) -> Result<(), ReconstructError> {
-        for (attribute, gradient) in Attribute::ALL.iter().zip(gradients) {
-            if let Some(i) = gradient.iter().position(|g| !g.is_finite()) {
-                let width = self.model.parameters.group(*attribute).width.max(1);
-                return Err(ReconstructError::NonFinite {
-                    what: format!("the gradient of `{}`", attribute.name()),
-                    step,
-                    detail: format!("Gaussian {}, component {}: {}", i / width, i % width, gradient[i]),
-                });
-            }
-        }
-        Ok(())
     }
 
     fn apply(
@@ -76,7 +77,7 @@ impl CpuEngine {
         network: &[Vec<f32>],
     ) -> Result<(), ReconstructError> {
         let gradients = self.model.parameters.pull(activated, grad);
-        self.check_gradients(&gradients, step)?;
+        check_gradients(&self.model.parameters, &gradients, step)?;
         let rates = self.model.config.rates.clone();
         let extent = self.model.scene.extent;
         let factor = plan.attribute_factor;
@@ -152,13 +153,8 @@ impl CpuEngine {
         for (i, origin) in plan.origins.iter().enumerate() {
             if origin.kind == OriginKind::SplitChild {
                 let s = origin.source as usize;
-                let (mean, scale) = split_child(
-                    g.means[s],
-                    g.scales[s],
-                    g.rotations[s],
-                    random.normal3(),
-                    config.split_divisor,
-                );
+                let (mean, scale) =
+                    split_child(g.means[s], g.scales[s], g.rotations[s], random.normal3(), config.split_divisor);
                 parameters.values_mut(Attribute::Mean)[3 * i..3 * i + 3].copy_from_slice(&mean.to_array());
                 let log = [scale.x.ln(), scale.y.ln(), scale.z.ln()];
                 parameters.values_mut(Attribute::Scale)[3 * i..3 * i + 3].copy_from_slice(&log);
@@ -252,8 +248,14 @@ impl Engine for CpuEngine {
             if let (Some(traced), true) = (traced, self.model.config.loss.visibility > 0.0) {
                 let t = Instant::now();
                 let mut random = Random::new(self.model.config.seed, Purpose::VisibilitySamples, step);
-                let value =
-                    objective::visibility_term(&self.model, &mut random, &light, traced, share, &mut total.visibility_sh)?;
+                let value = objective::visibility_term(
+                    &self.model,
+                    &mut random,
+                    &light,
+                    traced,
+                    share,
+                    &mut total.visibility_sh,
+                )?;
                 terms.add(&[value], share);
                 self.profile.add("visibility term", t);
             }
@@ -376,5 +378,23 @@ impl Engine for CpuEngine {
 
     fn profile(&self) -> Vec<(&'static str, f64)> {
         self.profile.parts.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_nan_in_a_gradient_is_found_and_named() {
+        let parameters = GaussianParameters::zeros(4, 3, 0);
+        let mut gradients: Vec<Vec<f32>> = parameters.groups().iter().map(|g| vec![0.0; g.values.len()]).collect();
+        assert!(check_gradients(&parameters, &gradients, 7).is_ok());
+        gradients[Attribute::Normal as usize][7] = f32::NAN;
+        let text = check_gradients(&parameters, &gradients, 7).unwrap_err().to_string();
+        assert!(
+            text.contains("step 7") && text.contains("`normal`") && text.contains("Gaussian 2, component 1"),
+            "{text}"
+        );
     }
 }

@@ -10,8 +10,8 @@ use diamond_camera::Camera;
 use diamond_light::{OlatLight, spherical_harmonics};
 use diamond_shading::{
     BrdfModel, Combine, Diffuse, Fresnel, GBuffer, IncidentModel, InputGradients, InputScaling, LightDistanceInput,
-    Masking, ResidualInputs, ShadedGrad, Shaded, ShadingConfig, SurfaceVisibility, TransferActivation, TransferConfig,
-    channel, shade, transfer_radiance,
+    Masking, Prepared, ResidualInputs, Shaded, ShadedGrad, ShadingConfig, SurfaceVisibility, TransferActivation,
+    TransferConfig, channel, shade, transfer_radiance,
 };
 use diamond_splat::{Cutoff, Features, Raster, RasterConfig, RasterGrad, project, rasterize_projected};
 use glam::{Quat, Vec2, Vec3};
@@ -205,6 +205,21 @@ impl LightRows {
     }
 }
 
+fn residual_inputs<'a>(model: &Model, rows: &'a Rows, lit: &'a LightRows) -> ResidualInputs<'a> {
+    ResidualInputs {
+        positions: &rows.positions,
+        rotations: &rows.rotations,
+        scales: &rows.scales,
+        view_directions: &rows.view_directions,
+        light_directions: &lit.directions,
+        normals: &rows.normals,
+        visibility: &lit.visibility,
+        light_distances: &lit.distances,
+        codes: &rows.codes,
+        code_size: model.config.residual.codes,
+    }
+}
+
 fn input_scaling(model: &Model) -> InputScaling {
     let (centre, half) = (model.scene.centre(), Vec3::splat(model.scene.radius));
     let mut scaling = InputScaling::of_bounds(centre - half, centre + half);
@@ -230,23 +245,11 @@ pub fn value_and_grad(
 ) -> Result<PairGrad, ReconstructError> {
     let n = model.len();
     let t = Instant::now();
-    let projection =
-        project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
+    let projection = project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
     let t = profile.add("project", t);
     let rows = Rows::new(model, activated, camera, projection.visible());
     let lit = LightRows::new(model, &rows, light, traced)?;
-    let inputs = ResidualInputs {
-        positions: &rows.positions,
-        rotations: &rows.rotations,
-        scales: &rows.scales,
-        view_directions: &rows.view_directions,
-        light_directions: &lit.directions,
-        normals: &rows.normals,
-        visibility: &lit.visibility,
-        light_distances: &lit.distances,
-        codes: &rows.codes,
-        code_size: model.config.residual.codes,
-    };
+    let inputs = residual_inputs(model, &rows, &lit);
     let scaling = input_scaling(model);
     let assembled = match &model.network {
         Some(_) => Some(inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?),
@@ -259,9 +262,9 @@ pub fn value_and_grad(
         _ => None,
     };
     let transfer = match transfer_config(model) {
-        Some(config) => Some(
-            transfer_radiance(&rows.transfer, &lit.directions, config).map_err(error::stage("transfer vectors"))?,
-        ),
+        Some(config) => {
+            Some(transfer_radiance(&rows.transfer, &lit.directions, config).map_err(error::stage("transfer vectors"))?)
+        }
         None => None,
     };
     let t = profile.add("residual forward", t);
@@ -275,12 +278,11 @@ pub fn value_and_grad(
         &lit.visibility,
     );
     let t = profile.add("features", t);
-    let (raster, raster_pullback) = rasterize_projected(&projection, &activated.gaussians, &features)
-        .map_err(error::stage("rasterize"))?;
+    let (raster, raster_pullback) =
+        rasterize_projected(&projection, &activated.gaussians, &features).map_err(error::stage("rasterize"))?;
     let t = profile.add("rasterize forward", t);
     let gbuffer = GBuffer { features: &raster.features, opacity: &raster.opacity, depth: &raster.depth };
-    let (shaded, shade_pullback) =
-        shade(&gbuffer, camera, light, &settings.shading).map_err(error::stage("shade"))?;
+    let (shaded, shade_pullback) = shade(&gbuffer, camera, light, &settings.shading).map_err(error::stage("shade"))?;
     let t = profile.add("shade forward", t);
 
     let grad = objective(&View { shaded: &shaded, raster: &raster })?;
@@ -406,77 +408,79 @@ fn write_transport(
     }
 }
 
-/// Renders one camera under each light: projection once, residual and shading per light.
-pub fn render(
-    model: &Model,
-    camera: &Camera,
-    lights: &[OlatLight],
-) -> Result<Vec<Rendering>, ReconstructError> {
+/// Lights whose residuals are blended in one rasterisation: bounds the memory of their channels.
+const LIGHTS_PER_RASTERISATION: usize = 16;
+
+/// Renders one camera under each light: one projection, one rasterisation for every [`LIGHTS_PER_RASTERISATION`] lights,
+/// residual and shading per light.
+pub fn render(model: &Model, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
     let activated = model.parameters.activate();
     let settings = Settings::rendering(model);
-    let projection =
-        project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
+    let projection = project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
     let rows = Rows::new(model, &activated, camera, projection.visible());
-    let bvh = match model.config.visibility.traced {
+    let tracer = match model.config.visibility.traced {
         true => Some(visibility_cache::Tracer::new(&activated.gaussians)?),
         false => None,
     };
-    let mut features = geometry_features(&activated, &rows);
+    let geometry = geometry_features(&activated, &rows);
     let scaling = input_scaling(model);
     let mut out = Vec::with_capacity(lights.len());
-    for light in lights {
-        let traced = match &bvh {
-            Some(tracer) => Some(tracer.trace(&activated.gaussians, &activated.normals, light)?),
-            None => None,
-        };
-        let light = model.scene.scaled_light(light);
-        let lit = LightRows::new(model, &rows, &light, traced.as_deref())?;
-        let network = match &model.network {
-            Some(network) => {
-                let inputs = ResidualInputs {
-                    positions: &rows.positions,
-                    rotations: &rows.rotations,
-                    scales: &rows.scales,
-                    view_directions: &rows.view_directions,
-                    light_directions: &lit.directions,
-                    normals: &rows.normals,
-                    visibility: &lit.visibility,
-                    light_distances: &lit.distances,
-                    codes: &rows.codes,
-                    code_size: model.config.residual.codes,
-                };
-                let (matrix, _) = inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?;
-                Some(network.forward(&matrix, rows.len()).map_err(error::stage("residual network"))?.0)
-            }
-            None => None,
-        };
-        let transfer = match transfer_config(model) {
-            Some(config) => Some(
-                transfer_radiance(&rows.transfer, &lit.directions, config)
-                    .map_err(error::stage("transfer vectors"))?
-                    .0,
-            ),
-            None => None,
-        };
-        write_transport(
-            &mut features,
-            channel::TRANSPORT.start,
-            &rows,
-            network.as_ref().map(|o| (o.residual.as_slice(), o.incident.as_slice())),
-            transfer.as_deref(),
-            &lit.visibility,
-        );
-        let (raster, _) = rasterize_projected(&projection, &activated.gaussians, &features)
-            .map_err(error::stage("rasterize"))?;
-        let gbuffer = GBuffer { features: &raster.features, opacity: &raster.opacity, depth: &raster.depth };
-        let (shaded, _) = shade(&gbuffer, camera, &light, &settings.shading).map_err(error::stage("shade"))?;
-        out.push(Rendering {
-            radiance: shaded.radiance,
-            surface: shaded.surface,
-            subsurface: shaded.subsurface,
-            opacity: raster.opacity,
-            maps: shaded.maps,
-        });
+    for group in lights.chunks(LIGHTS_PER_RASTERISATION) {
+        let (fixed, per_light) = (channel::GEOMETRY.len(), channel::TRANSPORT.len());
+        let mut features = Features::zeros(activated.gaussians.len(), fixed + per_light * group.len());
+        for &i in &rows.visible {
+            let i = i as usize;
+            features.row_mut(i)[channel::GEOMETRY].copy_from_slice(&geometry.row(i)[channel::GEOMETRY]);
+        }
+        for (k, light) in group.iter().enumerate() {
+            let traced = match &tracer {
+                Some(tracer) => Some(tracer.trace(&activated.gaussians, &activated.normals, light)?),
+                None => None,
+            };
+            let lit = LightRows::new(model, &rows, light, traced.as_deref())?;
+            let network = match &model.network {
+                Some(network) => {
+                    let inputs = residual_inputs(model, &rows, &lit);
+                    let (matrix, _) = inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?;
+                    Some(network.forward(&matrix, rows.len()).map_err(error::stage("residual network"))?.0)
+                }
+                None => None,
+            };
+            let transfer = match transfer_config(model) {
+                Some(config) => Some(
+                    transfer_radiance(&rows.transfer, &lit.directions, config)
+                        .map_err(error::stage("transfer vectors"))?
+                        .0,
+                ),
+                None => None,
+            };
+            write_transport(
+                &mut features,
+                fixed + per_light * k,
+                &rows,
+                network.as_ref().map(|o| (o.residual.as_slice(), o.incident.as_slice())),
+                transfer.as_deref(),
+                &lit.visibility,
+            );
+        }
+        let (raster, _) =
+            rasterize_projected(&projection, &activated.gaussians, &features).map_err(error::stage("rasterize"))?;
+        let blended = raster.features.channels_range(channel::GEOMETRY);
+        let gbuffer = GBuffer { features: &blended, opacity: &raster.opacity, depth: &raster.depth };
+        let prepared = Prepared::new(&gbuffer, camera, &settings.shading).map_err(error::stage("shade"))?;
+        for (k, light) in group.iter().enumerate() {
+            let first = fixed + per_light * k;
+            let transport = raster.features.channels_range(first..first + per_light);
+            let shaded =
+                prepared.shade(&model.scene.scaled_light(light), Some(&transport)).map_err(error::stage("shade"))?;
+            out.push(Rendering {
+                radiance: shaded.radiance,
+                surface: shaded.surface,
+                subsurface: shaded.subsurface,
+                opacity: raster.opacity.clone(),
+                maps: shaded.maps,
+            });
+        }
     }
     Ok(out)
 }

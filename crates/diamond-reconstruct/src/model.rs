@@ -63,12 +63,9 @@ impl Model {
         let distances = mean_squared_distance_to_nearest(&points.positions, 3);
         for i in 0..n {
             let p = points.positions[i];
-            let outward = points.normals[i]
-                .try_normalize()
-                .or_else(|| (p - scene.centre()).try_normalize())
-                .unwrap_or(Vec3::Z);
-            let width =
-                distances[i].sqrt().clamp(MIN_INITIAL_SCALE * scene.radius, MAX_INITIAL_SCALE * scene.radius);
+            let outward =
+                points.normals[i].try_normalize().or_else(|| (p - scene.centre()).try_normalize()).unwrap_or(Vec3::Z);
+            let width = distances[i].sqrt().clamp(MIN_INITIAL_SCALE * scene.radius, MAX_INITIAL_SCALE * scene.radius);
             let flat = config.initial.flatness < 1.0;
             let rotation = if flat { Quat::from_rotation_arc(Vec3::Z, outward) } else { Quat::IDENTITY };
             let normal = match config.initial.normals {
@@ -152,16 +149,11 @@ impl Model {
         let table =
             read_ply(&path).map_err(|e| ReconstructError::Checkpoint { path: path.clone(), detail: e.to_string() })?;
         let parameters = from_ply(&table, &config, &path)?;
-        let mut model = Self {
-            parameters,
-            network: None,
-            network_moments: Default::default(),
-            scene,
-            config: config.clone(),
-        };
+        let mut model =
+            Self { parameters, network: None, network_moments: Default::default(), scene, config: config.clone() };
         if config.residual.network {
-            let mut network = ResidualNetwork::initialise(&network_config(&config), &mut || 0.5)
-                .map_err(error::stage("network"))?;
+            let mut network =
+                ResidualNetwork::initialise(&network_config(&config), &mut || 0.5).map_err(error::stage("network"))?;
             let path = folder.join("network.safetensors");
             let mut file = TensorFile::read(&path)?;
             for (name, values) in network_parts_mut(&mut network) {
@@ -279,10 +271,8 @@ fn from_ply(table: &PlyTable, config: &Config, path: &Path) -> Result<GaussianPa
 
 /// The networks' parameter vectors by name, mutable.
 pub(crate) fn network_parts_mut(network: &mut ResidualNetwork) -> Vec<(&'static str, &mut Vec<f32>)> {
-    let mut out = vec![
-        ("trunk", &mut network.trunk.parameters),
-        ("residual_head", &mut network.residual_head.parameters),
-    ];
+    let mut out =
+        vec![("trunk", &mut network.trunk.parameters), ("residual_head", &mut network.residual_head.parameters)];
     if let Some(head) = &mut network.incident_head {
         out.push(("incident_head", &mut head.parameters));
     }

@@ -107,8 +107,8 @@ pub fn evaluate(
         add_scaled(&mut out.opacity, &l.grad, share * loss.mask);
     }
     if loss.normal > 0.0 {
-        let (pseudo, _) = pseudo_normals(pair.camera, &maps.depth, &view.raster.opacity)
-            .map_err(error::stage("pseudo-normals"))?;
+        let (pseudo, _) =
+            pseudo_normals(pair.camera, &maps.depth, &view.raster.opacity).map_err(error::stage("pseudo-normals"))?;
         // Where the pseudo-normal is undefined the rendered normal takes its place and the difference is 0.
         let mut target = pseudo;
         for (t, n) in target.data_mut().chunks_exact_mut(3).zip(maps.normal.data().chunks_exact(3)) {
@@ -133,9 +133,13 @@ pub fn evaluate(
             &mut out.shaded.maps.subsurfaceness,
         ),
     ];
+    let edges = match smooth.iter().any(|(_, weight, ..)| *weight > 0.0) {
+        true => Some(diamond_losses::EdgeWeights::new(pair.radiance, pair.mask).map_err(&fail)?),
+        false => None,
+    };
     for (term, weight, map, grad) in smooth {
-        if weight > 0.0 {
-            let l = diamond_losses::smoothness(map, pair.radiance, pair.mask).map_err(&fail)?;
+        if let (true, Some(edges)) = (weight > 0.0, &edges) {
+            let l = edges.smoothness(map).map_err(&fail)?;
             push(term, weight, l.value);
             add_scaled(grad, &l.grad, share * weight);
         }
@@ -176,7 +180,8 @@ pub fn visibility_term(
         .iter()
         .map(|&i| light.incidence(Vec3::from_slice(&means[3 * i..]), diamond_light::Falloff::None).direction)
         .collect();
-    let sh: Vec<f32> = rows.iter().flat_map(|&i| all[i * COEFFICIENTS..(i + 1) * COEFFICIENTS].iter().copied()).collect();
+    let sh: Vec<f32> =
+        rows.iter().flat_map(|&i| all[i * COEFFICIENTS..(i + 1) * COEFFICIENTS].iter().copied()).collect();
     let target: Vec<f32> = rows.iter().map(|&i| traced[i]).collect();
     let fitted = visibilities(&sh, &directions).map_err(error::stage("visibility term"))?;
     let l = diamond_losses::visibility(&fitted, &target).map_err(error::stage("visibility term"))?;

@@ -211,7 +211,9 @@ impl GaussianParameters {
         Activated {
             gaussians: Gaussians {
                 means: vec3s(self.values(Attribute::Mean)).collect(),
-                scales: vec3s(self.values(Attribute::Scale)).map(|s| Vec3::new(s.x.exp(), s.y.exp(), s.z.exp())).collect(),
+                scales: vec3s(self.values(Attribute::Scale))
+                    .map(|s| Vec3::new(s.x.exp(), s.y.exp(), s.z.exp()))
+                    .collect(),
                 rotations: self
                     .values(Attribute::Rotation)
                     .chunks_exact(4)
@@ -356,7 +358,8 @@ mod tests {
         grad.normals = (0..n).map(|_| random.normal3()).collect();
         grad.base_color = (0..n).map(|_| random.normal3()).collect();
         let pulled = p.pull(&at, &grad);
-        let close = |a: f32, b: f64, what: &str| assert!((a as f64 - b).abs() < 1e-5 * (1.0 + b.abs()), "{what} {a} {b}");
+        let close =
+            |a: f32, b: f64, what: &str| assert!((a as f64 - b).abs() < 1e-5 * (1.0 + b.abs()), "{what} {a} {b}");
         for i in 0..n {
             let logit = p.values(Attribute::Opacity)[i] as f64;
             let y = Dual::new(logit, 1.0).sigmoid();
@@ -367,8 +370,7 @@ mod tests {
                 let b = Dual::new(p.values(Attribute::BaseColor)[3 * i + c] as f64, 1.0).sigmoid();
                 close(pulled[Attribute::BaseColor as usize][3 * i + c], b.d * grad.base_color[i][c] as f64, "base");
                 let raw = &p.values(Attribute::Normal)[3 * i..3 * i + 3];
-                let x: Vec<Dual> =
-                    (0..3).map(|k| Dual::new(raw[k] as f64, if k == c { 1.0 } else { 0.0 })).collect();
+                let x: Vec<Dual> = (0..3).map(|k| Dual::new(raw[k] as f64, if k == c { 1.0 } else { 0.0 })).collect();
                 let length = (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]).sqrt();
                 let expected: f64 = (0..3).map(|k| (x[k] / length).d * grad.normals[i][k] as f64).sum();
                 close(pulled[Attribute::Normal as usize][3 * i + c], expected, "normal");

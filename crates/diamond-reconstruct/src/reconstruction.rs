@@ -38,12 +38,8 @@ impl Reconstruction {
         points: &InitialPoints,
     ) -> Result<Self, ReconstructError> {
         let model = Model::initial(config, scene, points)?;
-        let pairs: Vec<(usize, usize)> = capture
-            .train
-            .iter()
-            .enumerate()
-            .flat_map(|(v, view)| (0..view.shots.len()).map(move |s| (v, s)))
-            .collect();
+        let pairs: Vec<(usize, usize)> =
+            capture.train.iter().enumerate().flat_map(|(v, view)| (0..view.shots.len()).map(move |s| (v, s))).collect();
         if pairs.is_empty() {
             return Err(ReconstructError::Unusable {
                 detail: "the selection holds no image; choose at least one view and one light".into(),

@@ -61,8 +61,7 @@ impl TensorFile {
             .iter()
             .map(|(name, (_, values))| (name, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
             .collect();
-        let mut metadata: HashMap<String, String> =
-            self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
+        let mut metadata: HashMap<String, String> = self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
         metadata.insert(DIGEST_KEY.into(), digest(bytes.iter().map(|(n, b)| (*n, b.as_slice()))));
         let mut views = Vec::with_capacity(bytes.len());
         for (name, data) in &bytes {
@@ -82,7 +81,9 @@ impl TensorFile {
             source,
         })?;
         let broken = |e: safetensors::SafeTensorError| {
-            fail(format!("expected a safetensors file, found a broken one ({e}); use an older checkpoint or start anew"))
+            fail(format!(
+                "expected a safetensors file, found a broken one ({e}); use an older checkpoint or start anew"
+            ))
         };
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(broken)?;
         let parsed = SafeTensors::deserialize(&bytes).map_err(broken)?;
