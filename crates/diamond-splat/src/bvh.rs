@@ -1,7 +1,8 @@
 //! A bounding volume hierarchy over axis-aligned boxes: which of many boxes does a ray meet?
 //!
-//! Built top down with the surface area heuristic over binned centres. Nodes lie in depth-first order, the left child
-//! right behind its parent. After the boxes have moved a little the tree can be refitted: same topology, new bounds.
+//! A binary tree is built top down with the surface area heuristic over binned centres, and then flattened so that
+//! each node has up to eight children and each leaf is a packet of up to eight boxes: a vector register compares all of
+//! them at once. After the boxes have moved a little the tree can be refitted: same topology, new bounds.
 //! Building uses threads for large ranges; the tree does not depend on their number.
 use glam::{Vec3, Vec3A};
 
@@ -27,46 +28,68 @@ impl Aabb {
     }
 }
 
-/// A box and what hangs from it, 32 bytes.
+/// A binary node, while building.
 #[derive(Debug, Clone, Copy)]
 struct Node {
-    min: Vec3,
-    /// Leaf: first place in `order`. Inner: index of the right child; the left one follows its parent.
+    bounds: Aabb,
+    /// Leaf: first place in the order of items. Inner: index of the right child; the left one follows its parent.
     first: u32,
-    max: Vec3,
     /// Number of boxes in a leaf; 0 for inner nodes.
     count: u32,
 }
 
-impl Node {
-    fn bounds(&self) -> Aabb {
-        Aabb { min: self.min.into(), max: self.max.into() }
+/// Children of a node, and boxes of a leaf: as many as a vector of `f32` has lanes.
+pub(crate) const WIDTH: usize = 8;
+/// Marks a link to a packet; the other links lead to nodes.
+const PACKET: u32 = 1 << 31;
+/// A packet's place that holds no box.
+pub(crate) const NO_BOX: u32 = u32::MAX;
+
+/// Up to eight children: their boxes, one coordinate after the other, and where they lead.
+#[derive(Debug, Clone)]
+#[repr(align(64))]
+struct WideNode {
+    min: [[f32; WIDTH]; 3],
+    max: [[f32; WIDTH]; 3],
+    /// Index of a node, behind this one, or with [`PACKET`] set of a packet. Without meaning where the box is empty.
+    links: [u32; WIDTH],
+    /// Number of children.
+    count: u32,
+}
+
+impl WideNode {
+    fn set_bounds(&mut self, lane: usize, bounds: Aabb) {
+        for axis in 0..3 {
+            self.min[axis][lane] = bounds.min[axis];
+            self.max[axis][lane] = bounds.max[axis];
+        }
     }
 
-    fn set_bounds(&mut self, bounds: Aabb) {
-        (self.min, self.max) = (bounds.min.into(), bounds.max.into());
+    fn bounds(&self) -> Aabb {
+        let fold = |v: &[f32; WIDTH], f: fn(f32, f32) -> f32, from| v.iter().copied().fold(from, f);
+        let min = std::array::from_fn(|axis| fold(&self.min[axis], f32::min, f32::INFINITY));
+        let max = std::array::from_fn(|axis| fold(&self.max[axis], f32::max, f32::NEG_INFINITY));
+        Aabb { min: Vec3A::from_array(min), max: Vec3A::from_array(max) }
     }
 }
 
-/// The hierarchy.
+/// The hierarchy: wide nodes over packets of boxes.
 #[derive(Debug, Clone)]
 pub(crate) struct Bvh {
-    nodes: Vec<Node>,
-    /// Indices of the boxes, leaf by leaf.
-    order: Vec<u32>,
+    nodes: Vec<WideNode>,
+    /// Indices of the boxes in each leaf, [`NO_BOX`] where there are fewer than [`WIDTH`].
+    packets: Vec<[u32; WIDTH]>,
 }
 
-/// Most boxes in a leaf, where the heuristic has no better idea.
-const MAX_LEAF: usize = 4;
 /// Bins of the surface area heuristic per axis.
 const BINS: usize = 12;
-/// Cost of visiting a node relative to testing a box's content.
-const NODE_COST: f32 = 1.0;
+/// Cost of visiting a node relative to testing the content of a packet.
+const NODE_COST: f32 = 0.5;
 /// From this depth on ranges are halved by count, which bounds the depth whatever the boxes are (a geometric
 /// progression of centres would otherwise lose one box per level).
 const HALVE_FROM: usize = 40;
-/// Room for the traversal: `HALVE_FROM` levels and as many halvings as a `u32` allows.
-const STACK: usize = HALVE_FROM + 32;
+/// Room for the traversal: `HALVE_FROM` levels and as many halvings as a `u32` allows, each leaving all children but one.
+const STACK: usize = (HALVE_FROM + 32) * (WIDTH - 1) + 1;
 /// Ranges beyond this are built by two threads.
 const PARALLEL_FROM: usize = 4096;
 
@@ -74,6 +97,25 @@ struct Item {
     bounds: Aabb,
     centre: Vec3A,
     index: u32,
+}
+
+/// `f32::max` without its care for NaN: one instruction.
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// `f32::min` without its care for NaN: one instruction.
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// What happens at a leaf. A trait and not a closure, since closures cannot be inlined by force, and one that is not
+/// is compiled without the vector instructions of its caller.
+pub(crate) trait Visitor {
+    /// Looks at a packet; false ends the traversal.
+    fn packet(&mut self, packet: usize) -> bool;
 }
 
 impl Bvh {
@@ -85,100 +127,118 @@ impl Bvh {
             .enumerate()
             .map(|(i, &bounds)| Item { bounds, centre: centre(i).into(), index: i as u32 })
             .collect();
+        let mut bvh = Self { nodes: Vec::new(), packets: Vec::new() };
         if items.is_empty() {
-            return Self { nodes: Vec::new(), order: Vec::new() };
+            return bvh;
         }
-        let empty = Node { min: Vec3::INFINITY, first: u32::MAX, max: Vec3::NEG_INFINITY, count: 0 };
-        let mut sparse = vec![empty; 2 * items.len() - 1];
-        build_range(&mut items, 0, &mut sparse, 0, 0);
-        // A range of n boxes had 2n − 1 places; most leaves hold several boxes and leave places unused.
-        let mut place = vec![0u32; sparse.len()];
-        let mut used = 0;
-        for (node, place) in sparse.iter().zip(&mut place) {
-            *place = used;
-            used += (node.first != u32::MAX) as u32;
-        }
-        let nodes = sparse
-            .iter()
-            .filter(|node| node.first != u32::MAX)
-            .map(|&node| Node { first: if node.count == 0 { place[node.first as usize] } else { node.first }, ..node })
-            .collect();
-        Self { nodes, order: items.iter().map(|item| item.index).collect() }
+        // A range of n boxes has 2n − 1 places; most leaves hold several boxes and leave places unused.
+        let mut binary = vec![Node { bounds: Aabb::EMPTY, first: 0, count: 0 }; 2 * items.len() - 1];
+        build_range(&mut items, 0, &mut binary, 0, 0);
+        bvh.widen(&binary, 0, &items);
+        bvh
     }
 
-    /// Indices of the boxes in the order in which [`Bvh::visit`] numbers places.
-    pub fn order(&self) -> &[u32] {
-        &self.order
+    /// Appends the wide node that stands for binary node `root`, and all below it; gives its index.
+    fn widen(&mut self, binary: &[Node], root: usize, items: &[Item]) -> u32 {
+        // The child with the largest box is replaced by its own two children while there is room.
+        let mut children = [root; WIDTH];
+        let mut count = 1;
+        while count < WIDTH {
+            let inner = (0..count).filter(|&i| binary[children[i]].count == 0);
+            let area = |i: usize| binary[children[i]].bounds.half_area();
+            let Some(largest) = inner.reduce(|a, b| if area(b) > area(a) { b } else { a }) else { break };
+            let opened = children[largest];
+            children[largest] = opened + 1;
+            children[count] = binary[opened].first as usize;
+            count += 1;
+        }
+        let (inf, neg) = ([f32::INFINITY; WIDTH], [f32::NEG_INFINITY; WIDTH]);
+        let mut node = WideNode { min: [inf; 3], max: [neg; 3], links: [0; WIDTH], count: count as u32 };
+        let at = self.nodes.len();
+        self.nodes.push(node.clone());
+        for (lane, &child) in children[..count].iter().enumerate() {
+            let Node { bounds, first, count } = binary[child];
+            node.set_bounds(lane, bounds);
+            node.links[lane] = if count > 0 {
+                let mut packet = [NO_BOX; WIDTH];
+                let leaf = &items[first as usize..(first + count) as usize];
+                packet.iter_mut().zip(leaf).for_each(|(place, item)| *place = item.index);
+                self.packets.push(packet);
+                (self.packets.len() - 1) as u32 | PACKET
+            } else {
+                self.widen(binary, child, items)
+            };
+        }
+        self.nodes[at] = node;
+        at as u32
+    }
+
+    /// Indices of the boxes in each leaf, [`NO_BOX`] where there are fewer.
+    pub fn packets(&self) -> &[[u32; WIDTH]] {
+        &self.packets
     }
 
     /// New bounds for boxes that have moved; as many as at building.
     pub fn refit(&mut self, boxes: &[Aabb]) {
         for at in (0..self.nodes.len()).rev() {
-            let node = self.nodes[at];
-            let bounds = if node.count > 0 {
-                let range = node.first as usize..(node.first + node.count) as usize;
-                self.order[range].iter().fold(Aabb::EMPTY, |all, &i| all.union(boxes[i as usize]))
-            } else {
-                self.nodes[at + 1].bounds().union(self.nodes[node.first as usize].bounds())
-            };
-            self.nodes[at].set_bounds(bounds);
+            for lane in 0..self.nodes[at].count as usize {
+                let link = self.nodes[at].links[lane];
+                let bounds = if link & PACKET != 0 {
+                    let packet = self.packets[(link & !PACKET) as usize];
+                    let present = packet.iter().filter(|&&i| i != NO_BOX);
+                    present.fold(Aabb::EMPTY, |all, &i| all.union(boxes[i as usize]))
+                } else {
+                    self.nodes[link as usize].bounds()
+                };
+                self.nodes[at].set_bounds(lane, bounds);
+            }
         }
     }
 
-    /// Calls `visit` with ranges of places in [`Bvh::order`] whose boxes the ray may meet between `t_min` and
-    /// `t_max`, in an order that depends on the tree and the ray alone, until it returns false.
-    #[inline]
-    pub fn visit(
-        &self,
-        origin: Vec3,
-        direction: Vec3,
-        t_min: f32,
-        t_max: f32,
-        mut visit: impl FnMut(std::ops::Range<usize>) -> bool,
-    ) {
+    /// Shows `visitor` the index of each packet in whose box the ray may be between `t_min` and `t_max`, in an
+    /// order that depends on the tree and the ray alone, until it returns false.
+    #[inline(always)]
+    pub fn visit(&self, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32, visitor: &mut impl Visitor) {
         if self.nodes.is_empty() {
             return;
         }
-        let origin = Vec3A::from(origin);
         // A component of zero would make 0·∞ below; this one's inverse is finite and the ray as good as parallel.
         const PARALLEL: f32 = 1e-20;
-        let safe = |v: f32| if v.abs() < PARALLEL { PARALLEL.copysign(v) } else { v };
-        let inverse = Vec3A::new(1.0 / safe(direction.x), 1.0 / safe(direction.y), 1.0 / safe(direction.z));
-        let met = |node: &Node| {
-            let a = (Vec3A::from(node.min) - origin) * inverse;
-            let b = (Vec3A::from(node.max) - origin) * inverse;
-            let (near, far) = (a.min(b), a.max(b));
-            near.max_element().max(t_min) <= far.min_element().min(t_max)
-        };
+        let inverse = direction.to_array().map(|v| 1.0 / if v.abs() < PARALLEL { PARALLEL.copysign(v) } else { v });
+        let origin = origin.to_array();
         let mut stack = [0u32; STACK];
-        let mut top = 0;
-        let mut at = 0u32;
-        if !met(&self.nodes[0]) {
-            return;
-        }
-        loop {
-            let node = &self.nodes[at as usize];
-            if node.count > 0 {
-                if !visit(node.first as usize..(node.first + node.count) as usize) {
+        let mut top = 1;
+        while top > 0 {
+            top -= 1;
+            let link = stack[top];
+            if link & PACKET != 0 {
+                if !visitor.packet((link & !PACKET) as usize) {
                     return;
                 }
-            } else {
-                let (left, right) = (at + 1, node.first);
-                let (meets_left, meets_right) = (met(&self.nodes[left as usize]), met(&self.nodes[right as usize]));
-                if meets_left || meets_right {
-                    if meets_left && meets_right {
-                        stack[top] = right;
-                        top += 1;
-                    }
-                    at = if meets_left { left } else { right };
-                    continue;
-                }
+                continue;
             }
-            if top == 0 {
-                return;
+            let node = &self.nodes[link as usize];
+            // By the sign of the direction, not by comparing: so an empty box (∞, −∞) is never met.
+            let planes = |axis: usize| match inverse[axis] < 0.0 {
+                false => (&node.min[axis], &node.max[axis]),
+                true => (&node.max[axis], &node.min[axis]),
+            };
+            let ((enter_x, leave_x), (enter_y, leave_y), (enter_z, leave_z)) = (planes(0), planes(1), planes(2));
+            let mut met = 0u32;
+            for lane in 0..WIDTH {
+                let (ax, bx) = ((enter_x[lane] - origin[0]) * inverse[0], (leave_x[lane] - origin[0]) * inverse[0]);
+                let (ay, by) = ((enter_y[lane] - origin[1]) * inverse[1], (leave_y[lane] - origin[1]) * inverse[1]);
+                let (az, bz) = ((enter_z[lane] - origin[2]) * inverse[2], (leave_z[lane] - origin[2]) * inverse[2]);
+                let near = larger(larger(ax, ay), larger(az, t_min));
+                let far = smaller(smaller(bx, by), smaller(bz, t_max));
+                met |= ((near <= far) as u32) << lane;
             }
-            top -= 1;
-            at = stack[top];
+            while met != 0 {
+                let lane = met.trailing_zeros() as usize;
+                met &= met - 1;
+                stack[top] = node.links[lane];
+                top += 1;
+            }
         }
     }
 }
@@ -187,7 +247,7 @@ impl Bvh {
 fn build_range(items: &mut [Item], item_base: u32, nodes: &mut [Node], node_base: u32, depth: usize) {
     let n = items.len();
     let bounds = items.iter().fold(Aabb::EMPTY, |all, item| all.union(item.bounds));
-    nodes[0].set_bounds(bounds);
+    nodes[0].bounds = bounds;
     let middle = match choose_split(items, bounds, depth) {
         Some(middle) => middle,
         None => {
@@ -230,7 +290,7 @@ fn choose_split(items: &mut [Item], bounds: Aabb, depth: usize) -> Option<usize>
     };
     // Equal centres (or ones whose distance overflows) cannot be binned.
     if depth >= HALVE_FROM || !(extent[axis] > 0.0 && extent[axis].is_finite()) {
-        return if n <= MAX_LEAF { None } else { halve(items) };
+        return if n <= WIDTH { None } else { halve(items) };
     }
     let scale = Vec3A::splat(BINS as f32) / extent.max(Vec3A::splat(f32::MIN_POSITIVE));
     let bin = |centre: Vec3A, axis: usize| ((((centre - low) * scale)[axis]) as usize).min(BINS - 1);
@@ -242,6 +302,8 @@ fn choose_split(items: &mut [Item], bounds: Aabb, depth: usize) -> Option<usize>
             *count += 1;
         }
     }
+    // The cost of a range is that of its packets, as if they were packed half full.
+    let packets = |count: usize| (count as f32 / (0.5 * WIDTH as f32)).max(1.0);
     let mut best = (f32::INFINITY, 0, 0);
     for axis in 0..3 {
         let mut right_cost = [0.0; BINS];
@@ -249,13 +311,13 @@ fn choose_split(items: &mut [Item], bounds: Aabb, depth: usize) -> Option<usize>
         for i in (1..BINS).rev() {
             all = all.union(bins[axis][i].0);
             count += bins[axis][i].1;
-            right_cost[i] = if count == 0 { f32::INFINITY } else { all.half_area() * count as f32 };
+            right_cost[i] = if count == 0 { f32::INFINITY } else { all.half_area() * packets(count) };
         }
         let (mut all, mut count) = (Aabb::EMPTY, 0);
         for i in 0..BINS - 1 {
             all = all.union(bins[axis][i].0);
             count += bins[axis][i].1;
-            let cost = all.half_area() * count as f32 + right_cost[i + 1];
+            let cost = all.half_area() * packets(count) + right_cost[i + 1];
             if count > 0 && cost < best.0 {
                 best = (cost, axis, i);
             }
@@ -263,10 +325,10 @@ fn choose_split(items: &mut [Item], bounds: Aabb, depth: usize) -> Option<usize>
     }
     let (cost, axis, last_left) = best;
     if !cost.is_finite() {
-        return if n <= MAX_LEAF { None } else { halve(items) };
+        return if n <= WIDTH { None } else { halve(items) };
     }
     let area = bounds.half_area();
-    if n <= MAX_LEAF && cost + NODE_COST * area >= n as f32 * area {
+    if n <= WIDTH && cost + NODE_COST * area >= area {
         return None;
     }
     let mut left = 0;
@@ -301,11 +363,16 @@ mod tests {
     }
 
     fn visited(bvh: &Bvh, origin: Vec3, direction: Vec3) -> Vec<u32> {
-        let mut found = Vec::new();
-        bvh.visit(origin, direction, 0.0, 5.0, |places| {
-            found.extend(&bvh.order()[places]);
-            true
-        });
+        struct Collect<'a>(&'a Bvh, Vec<u32>);
+        impl Visitor for Collect<'_> {
+            fn packet(&mut self, packet: usize) -> bool {
+                self.1.extend(self.0.packets()[packet].iter().filter(|&&i| i != NO_BOX));
+                true
+            }
+        }
+        let mut collect = Collect(bvh, Vec::new());
+        bvh.visit(origin, direction, 0.0, 5.0, &mut collect);
+        let mut found = collect.1;
         found.sort_unstable();
         found
     }
@@ -322,7 +389,7 @@ mod tests {
             axis in 0usize..6,
         ) {
             let mut bvh = Bvh::build(&boxes, centre(&boxes));
-            let mut order = bvh.order().to_vec();
+            let mut order: Vec<u32> = bvh.packets().iter().flatten().copied().filter(|&i| i != NO_BOX).collect();
             order.sort_unstable();
             prop_assert_eq!(order, (0..boxes.len() as u32).collect::<Vec<_>>());
             let origin = Vec3::from(origin);

@@ -300,3 +300,38 @@ fn thread_counts_do_not_change_a_bit() {
         assert_eq!(one, run(threads).iter().map(|v| v.to_bits()).collect::<Vec<_>>());
     }
 }
+
+/// Milliseconds of this thread: processor time where the system tells, so that a busy machine does not blur it.
+fn thread_ms(start: std::time::Instant) -> f64 {
+    let read = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
+    let nanoseconds = read.and_then(|s| s.split_whitespace().next()?.parse::<f64>().ok());
+    nanoseconds.map_or_else(|| start.elapsed().as_secs_f64() * 1e3, |ns| ns * 1e-6)
+}
+
+/// Times on one thread, for whoever changes the hierarchy:
+/// `cargo test -p diamond-splat --test visibility -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement, not a test"]
+fn timing() {
+    let begin = std::time::Instant::now();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    for (n, flatness, opacity) in [(10_000, 0.1, 0.95), (10_000, 1.0, 0.95), (10_000, 0.1, 0.1), (100_000, 0.1, 0.95)] {
+        pool.install(|| {
+            let (gaussians, normals) = sphere(n, 1.0, flatness, opacity);
+            let mean = |f: &mut dyn FnMut()| {
+                let start = thread_ms(begin);
+                (0..20).for_each(|_| f());
+                (thread_ms(begin) - start) / 20.0
+            };
+            let mut bvh = GaussianBvh::build(&gaussians).unwrap();
+            let build = mean(&mut || bvh = GaussianBvh::build(&gaussians).unwrap());
+            let refit = mean(&mut || bvh.refit(&gaussians).unwrap());
+            let light = sun(Vec3::new(0.3, -0.5, 0.8).normalize());
+            let config = VisibilityConfig::default();
+            let trace = mean(&mut || {
+                bvh.visibility_to_light(&gaussians, Some(&normals), &light, &config).unwrap();
+            });
+            println!("{n} splats, flatness {flatness}, opacity {opacity}: build {build:.2} ms, refit {refit:.2}, trace {trace:.2}");
+        });
+    }
+}
