@@ -59,10 +59,10 @@ pub const PACKAGES: &[Package] = &[
         optional: &["rayon", "pulp"],
         alone: Some(&["glam"]),
     },
-    Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &[], alone: Some(&[]) },
+    Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(&[]) },
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2"]),
     light("diamond-losses", 2, &[]),
-    heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "sha2"]),
+    heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2"]),
     heavy(
         "diamond-sss",
         5,
