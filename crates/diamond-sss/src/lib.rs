@@ -1,1 +1,50 @@
-//! See Cargo.toml.
+//! Orchestration: from a capture to a relightable model, its figures, pictures and report. The `diamond` program is a thin
+//! shell around this library.
+//!
+//! Invariant: nothing here computes gradients or shades; everything that is written to disk is written beside its place,
+//! synchronised and renamed, so that a crash never leaves half a file. Only the program parses command lines and prints.
+//!
+//! ```no_run
+//! use diamond_sss::{ReconstructOptions, reconstruct};
+//! use std::sync::atomic::AtomicBool;
+//! let mut options = ReconstructOptions::new("capture", "out");
+//! options.steps = Some(1000);
+//! let outcome = reconstruct(&options, &mut |_| {}, &AtomicBool::new(false))?;
+//! assert!(outcome.metrics.is_some());
+//! # Ok::<(), diamond_sss::SssError>(())
+//! ```
+mod camera_path;
+mod capture_check;
+mod error;
+mod evaluation;
+mod export;
+mod inspect;
+mod light_choice;
+mod metrics_file;
+mod output_file;
+mod peak_memory;
+mod picture;
+mod reconstruct_run;
+mod relight;
+mod render_run;
+mod report;
+mod run_record;
+mod training_log;
+
+pub use camera_path::{CameraChoice, cameras_of, read_cameras};
+pub use capture_check::open_capture;
+pub use error::SssError;
+pub use evaluation::{ImageScore, PSNR_CAP, Scored, evaluate_model};
+pub use export::export_model;
+pub use inspect::{inspect_picture, inspect_text};
+pub use light_choice::{LightChoice, LightMix, parse_mix, parse_vec3};
+pub use metrics_file::{Metrics, Summary, evaluate_folder};
+pub use output_file::write_output;
+pub use peak_memory::peak_bytes;
+pub use picture::{encode_exr, encode_png_grey, encode_png_rgb};
+pub use reconstruct_run::{Event, Outcome, ReconstructOptions, reconstruct};
+pub use relight::render_lights;
+pub use render_run::{RenderOptions, render_folder};
+pub use report::write_report;
+pub use run_record::{RunRecord, StoredCamera, StoredLight};
+pub use training_log::{LogRow, TrainingLog};

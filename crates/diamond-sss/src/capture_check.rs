@@ -1,0 +1,24 @@
+//! Opening a capture for a long run: what is broken is found at the start and not hours later.
+use crate::SssError;
+use diamond_dataset::{Capture, DatasetError, OpenOptions, Shot};
+use diamond_reconstruct::Config;
+use rayon::prelude::*;
+use std::path::Path;
+
+/// Opens a capture as a configuration says.
+pub fn open_capture(path: &Path, config: &Config) -> Result<Capture, SssError> {
+    let options = OpenOptions {
+        transfer: config.input.transfer.transfer(),
+        cache_bytes: config.input.cache_bytes,
+        ..OpenOptions::default()
+    };
+    Ok(Capture::open(path, &options)?)
+}
+
+/// Decodes every image of the capture once; the error is that of the first broken one, in the order of the files.
+pub(crate) fn check_images(capture: &Capture) -> Result<(), DatasetError> {
+    let shots: Vec<&Shot> = capture.train.iter().chain(&capture.test).flat_map(|v| &v.shots).collect();
+    let results: Vec<Result<(), DatasetError>> =
+        shots.par_iter().map(|shot| capture.observation(shot).map(|_| ())).collect();
+    results.into_iter().collect()
+}

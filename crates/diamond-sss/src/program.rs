@@ -1,0 +1,103 @@
+//! From the command line to the library and back to an exit code.
+mod cli;
+mod progress;
+mod reconstruct;
+
+use clap::Parser;
+use cli::{Cli, Command, RenderArguments};
+use diamond_reconstruct::{Config, PRESETS};
+use diamond_sss::{CameraChoice, LightChoice, RenderOptions, SssError};
+use progress::Counter;
+use std::io::Write;
+use std::process::ExitCode;
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let filter = tracing_subscriber::EnvFilter::try_from_env("DIAMOND_LOG")
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .without_time()
+        .init();
+    match run(cli.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("diamond: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+/// Prints; that the reader has gone (`diamond … | head`) is no error.
+fn print(text: &str) {
+    let _ = std::io::stdout().write_all(text.as_bytes());
+}
+
+fn run(command: Command) -> Result<(), SssError> {
+    match command {
+        Command::Reconstruct(arguments) => reconstruct::run(arguments),
+        Command::Evaluate { dir, capture, save_images } => {
+            let mut counter = Counter::new("evaluating");
+            let metrics =
+                diamond_sss::evaluate_folder(&dir, &capture, save_images, &mut |done, all| counter.show(done, all))?;
+            counter.finish();
+            print(&metrics.to_table());
+            print(&format!("written: {}\n", dir.join("metrics.json").display()));
+            Ok(())
+        }
+        Command::Render(arguments) => {
+            let mut counter = Counter::new("rendering");
+            let written =
+                diamond_sss::render_folder(&render_options(arguments)?, &mut |done, all| counter.show(done, all))?;
+            counter.finish();
+            written.iter().for_each(|path| print(&format!("{}\n", path.display())));
+            Ok(())
+        }
+        Command::Inspect { capture, output } => {
+            let capture = diamond_dataset::Capture::open(&capture, &Default::default())?;
+            print(&diamond_sss::inspect_text(&capture));
+            if let Some(path) = output {
+                let picture = diamond_sss::inspect_picture(&capture)?;
+                let bytes: Vec<u8> =
+                    picture.data().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+                let png = diamond_sss::encode_png_rgb(&bytes, picture.width(), picture.height())?;
+                diamond_sss::write_output(&path, &png)?;
+                print(&format!("written: {}\n", path.display()));
+            }
+            Ok(())
+        }
+        Command::Export { dir, output, materials } => {
+            let count = diamond_sss::export_model(&dir, &output, materials)?;
+            print(&format!("written: {} ({count} Gaussians)\n", output.display()));
+            Ok(())
+        }
+        Command::Presets { name } => {
+            match name {
+                Some(name) => print(&Config::load(&name)?.to_toml()?),
+                None => PRESETS.iter().for_each(|name| print(&format!("{name}\n"))),
+            }
+            Ok(())
+        }
+    }
+}
+
+fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {
+    let cameras = match (a.orbit, a.camera, a.view) {
+        (Some(count), _, _) => CameraChoice::Orbit(count),
+        (_, Some(path), _) => CameraChoice::File(path),
+        (_, _, Some(index)) => CameraChoice::View { capture: a.capture, index },
+        _ if a.capture.is_some() => CameraChoice::View { capture: a.capture, index: 0 },
+        _ => CameraChoice::First,
+    };
+    let lights = match (a.light, a.direction, a.mix, a.lights) {
+        (Some(v), ..) => LightChoice::Point(diamond_sss::parse_vec3(&v)?),
+        (_, Some(v), ..) => LightChoice::Direction(diamond_sss::parse_vec3(&v)?),
+        (_, _, Some(v), _) => LightChoice::Mix(diamond_sss::parse_mix(&v)?),
+        (_, _, _, Some(n)) => LightChoice::Dome(n),
+        _ => LightChoice::Training,
+    };
+    Ok(RenderOptions { folder: a.dir, output: a.output, cameras, lights, size: a.size, linear: a.linear })
+}

@@ -1,0 +1,177 @@
+//! The words of the command line.
+use clap::{Args, Parser, Subcommand};
+use diamond_dataset::Selection;
+use std::path::PathBuf;
+
+/// Reconstructs translucent objects from photographs under one light at a time, and shows them under any light.
+#[derive(Debug, Parser)]
+#[command(name = "diamond", version, after_help = "Exit codes: 0 done, 1 the run failed, 2 usage, 3 bad input (capture, \
+configuration, model files), 130 interrupted.\nSet DIAMOND_LOG=debug for more messages.")]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Make a relightable model from a capture: model, figures, report
+    Reconstruct(ReconstructArguments),
+    /// Measure a model on the held-out images of a capture; rewrites metrics.json
+    #[command(after_help = "Example:\n  diamond evaluate out capture --save-images")]
+    Evaluate {
+        /// Folder of a finished reconstruction
+        dir: PathBuf,
+        /// The capture
+        capture: PathBuf,
+        /// Also write DIR/images/{name}_{render,truth,flip}.png
+        #[arg(long)]
+        save_images: bool,
+    },
+    /// Render a model: any camera path, any light or mix of lights
+    Render(RenderArguments),
+    /// Say what is in a capture: cameras, lights, coverage, exposure, what is missing
+    #[command(after_help = "Examples:\n  diamond inspect capture\n  diamond inspect capture -o overview.png")]
+    Inspect {
+        /// The capture
+        capture: PathBuf,
+        /// Also draw a picture (PNG)
+        #[arg(short, long)]
+        output: Option<PathBuf>,
+    },
+    /// Write the Gaussians for other programs
+    #[command(after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials")]
+    Export {
+        /// Folder of a finished reconstruction
+        dir: PathBuf,
+        /// The PLY file to write
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Add base colour, roughness, metalness and subsurfaceness
+        #[arg(long)]
+        materials: bool,
+    },
+    /// List the presets, or print one as TOML to start a configuration from
+    #[command(after_help = "Examples:\n  diamond presets\n  diamond presets resolved > mine.toml")]
+    Presets {
+        /// Name of a preset
+        name: Option<String>,
+    },
+}
+
+/// Options of `reconstruct`.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  diamond reconstruct capture -o out
+  diamond reconstruct capture -o out --views 3 --lights 3 --steps 3000
+  diamond reconstruct capture -o out --preset mine.toml --seed 7
+  diamond reconstruct capture -o out --resume")]
+pub struct ReconstructArguments {
+    /// The capture: a folder with transforms_train.json
+    pub capture: PathBuf,
+    /// Folder for the results
+    #[arg(short, long)]
+    pub output: PathBuf,
+    /// resolved, sss-3dgs, paper, or a TOML file
+    #[arg(long, default_value = "resolved")]
+    pub preset: String,
+    /// Length of the run in steps
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    pub steps: Option<u64>,
+    /// Seed of every random choice
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Threads; the result does not depend on it [default: all]
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    pub threads: Option<u16>,
+    /// Training views: a count, or indices such as 0,5,7 or 0-7
+    #[arg(long, default_value = "all")]
+    pub views: Selection,
+    /// Training lights: a count, or indices such as 0,5,7 or 0-7
+    #[arg(long, default_value = "all")]
+    pub lights: Selection,
+    /// Continue an interrupted run, with the same options
+    #[arg(long, conflicts_with = "force")]
+    pub resume: bool,
+    /// Replace the results of an earlier run
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// Options of `render`.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  diamond render out -o picture.png --light 2,3,4
+  diamond render out -o film --orbit 60 --direction 0,0,1
+  diamond render out -o picture.png --mix \"4,0,2:1,0.6,0.3;-4,0,2:0.3,0.6,1\"
+  diamond render out -o rig --capture capture --view 2 --lights 16
+  diamond render out -o picture.exr --linear --size 512x512")]
+pub struct RenderArguments {
+    /// Folder of a finished reconstruction
+    pub dir: PathBuf,
+    /// A file for one picture, else a folder
+    #[arg(short, long)]
+    pub output: PathBuf,
+    /// Capture whose held-out (or training) views --view counts [default: the training views of the run]
+    #[arg(long)]
+    pub capture: Option<PathBuf>,
+    /// Render this view
+    #[arg(long, group = "from")]
+    pub view: Option<usize>,
+    /// Render a turn round the object in so many frames
+    #[arg(long, group = "from", value_parser = at_least_one)]
+    pub orbit: Option<usize>,
+    /// Render the camera or cameras of a JSON file
+    #[arg(long, group = "from")]
+    pub camera: Option<PathBuf>,
+    /// A point light at x,y,z
+    #[arg(long, group = "under", allow_hyphen_values = true)]
+    pub light: Option<String>,
+    /// A light at infinity in direction x,y,z (from the object to the light)
+    #[arg(long, group = "under", allow_hyphen_values = true)]
+    pub direction: Option<String>,
+    /// Several point lights at once: "x,y,z:r,g,b;…"
+    #[arg(long, group = "under", allow_hyphen_values = true)]
+    pub mix: Option<String>,
+    /// So many lights of an even dome, one picture each
+    #[arg(long, group = "under", value_parser = at_least_one)]
+    pub lights: Option<usize>,
+    /// Size of the pictures, WIDTHxHEIGHT
+    #[arg(long, value_parser = size)]
+    pub size: Option<(u32, u32)>,
+    /// Linear light as EXR instead of sRGB as PNG
+    #[arg(long)]
+    pub linear: bool,
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(n @ 1..=100_000) => Ok(n),
+        _ => Err("expected a number from 1 to 100000".into()),
+    }
+}
+
+/// Longest side of a rendered picture.
+const MAX_SIDE: u32 = 8192;
+
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let parsed = text.split_once(['x', '×']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    match parsed {
+        Some((w, h)) if (1..=MAX_SIDE).contains(&w) && (1..=MAX_SIDE).contains(&h) => Ok((w, h)),
+        _ => Err(format!("expected WIDTHxHEIGHT, each from 1 to {MAX_SIDE}")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        use clap::CommandFactory;
+        Cli::command().debug_assert();
+        assert_eq!(size("64x48"), Ok((64, 48)));
+        assert!(size("64").is_err() && size("0x4").is_err() && size("99999x1").is_err());
+    }
+}

@@ -1,0 +1,303 @@
+//! A whole run: from a capture to model, figures and report, with checkpoints on the way.
+use crate::capture_check::{check_images, open_capture};
+use crate::evaluation::evaluate_with;
+use crate::output_file::write_json;
+use crate::render_run::holds_results;
+use crate::run_record::RunRecord;
+use crate::{Metrics, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
+use diamond_dataset::{Capture, Selection};
+use diamond_reconstruct::{Config, Reconstruction, StepReport};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// What to reconstruct, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReconstructOptions {
+    /// The capture.
+    pub capture: PathBuf,
+    /// The run's folder.
+    pub output: PathBuf,
+    /// Preset, or path of a TOML file.
+    pub preset: String,
+    /// Length of the run; the configuration's where absent.
+    pub steps: Option<u64>,
+    /// Seed; the configuration's where absent.
+    pub seed: Option<u64>,
+    /// Threads; all where absent. The result does not depend on it.
+    pub threads: Option<usize>,
+    /// Training views.
+    pub views: Selection,
+    /// Training lights.
+    pub lights: Selection,
+    /// Continue from the checkpoint.
+    pub resume: bool,
+    /// Replace the results of an earlier run.
+    pub force: bool,
+    /// The command line, for the report.
+    pub command: String,
+}
+
+impl ReconstructOptions {
+    /// The default preset on all images.
+    pub fn new(capture: impl Into<PathBuf>, output: impl Into<PathBuf>) -> Self {
+        Self {
+            capture: capture.into(),
+            output: output.into(),
+            preset: "resolved".into(),
+            steps: None,
+            seed: None,
+            threads: None,
+            views: Selection::All,
+            lights: Selection::All,
+            resume: false,
+            force: false,
+            command: String::new(),
+        }
+    }
+
+    /// The configuration with the options laid over it.
+    pub fn config(&self) -> Result<Config, SssError> {
+        let mut config = Config::load(&self.preset)?;
+        config.steps = self.steps.unwrap_or(config.steps);
+        config.seed = self.seed.unwrap_or(config.seed);
+        config.validate(&self.preset)?;
+        Ok(config)
+    }
+}
+
+/// What happens during a run.
+#[derive(Debug, Clone)]
+pub enum Event<'a> {
+    /// Something worth knowing.
+    Note(String),
+    /// The steps begin.
+    Started {
+        /// Steps done in earlier sessions.
+        done: u64,
+        /// All steps.
+        steps: u64,
+        /// Images to learn from.
+        images: usize,
+    },
+    /// A step is done.
+    Step {
+        /// What it did.
+        report: &'a StepReport,
+        /// PSNR of the training images over about the last 100 steps, dB.
+        psnr: f64,
+    },
+    /// A checkpoint is on disk.
+    Checkpoint {
+        /// Steps done.
+        step: u64,
+    },
+    /// A held-out image was evaluated.
+    Evaluated {
+        /// Images done.
+        done: usize,
+        /// All images.
+        all: usize,
+    },
+}
+
+/// What a run has come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome {
+    /// Figures on the held-out images; without such images every figure is absent, with the reason.
+    pub metrics: Option<Metrics>,
+    /// Seconds of all sessions.
+    pub seconds: f64,
+    /// Gaussians of the model.
+    pub gaussians: usize,
+}
+
+/// Costs of the sessions so far, kept with the checkpoint.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+struct Costs {
+    seconds: f64,
+    peak_bytes: Option<u64>,
+    profile: Vec<(String, f64)>,
+}
+
+const COSTS_FILE: &str = "costs.json";
+
+/// Files and folders that a run writes; `--force` removes these and nothing else.
+const RESULTS: [&str; 13] = [
+    "model.ply", "config.toml", "scene.toml", "network.safetensors", "metrics.json", "metrics.csv", "report.html",
+    "log.csv", "profile.json", "run.json", "checkpoint/state.safetensors", "checkpoint/costs.json", "images",
+];
+
+fn clear(folder: &Path) -> Result<(), SssError> {
+    for name in RESULTS {
+        let path = folder.join(name);
+        let removed = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        match removed {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(SssError::io(&path, "remove the earlier result")(e));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Reconstructs. `events` is told what happens; when `interrupted` becomes true the step is finished, a checkpoint
+/// written, and [`SssError::Interrupted`] returned. The same bits come out whatever the number of threads.
+pub fn reconstruct(
+    options: &ReconstructOptions,
+    events: &mut (dyn FnMut(Event<'_>) + Send),
+    interrupted: &AtomicBool,
+) -> Result<Outcome, SssError> {
+    let Some(threads) = options.threads else { return run(options, events, interrupted) };
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads.max(1))
+        .build()
+        .map_err(|e| SssError::Usage(format!("{threads} threads cannot be started: {e}")))?;
+    pool.install(|| run(options, events, interrupted))
+}
+
+fn run(
+    options: &ReconstructOptions,
+    events: &mut (dyn FnMut(Event<'_>) + Send),
+    interrupted: &AtomicBool,
+) -> Result<Outcome, SssError> {
+    let begun = Instant::now();
+    let config = options.config()?;
+    let folder = options.output.as_path();
+    let checkpoint = folder.join("checkpoint");
+    if options.resume && options.force {
+        return Err(SssError::Usage("--resume and --force contradict each other; choose one".into()));
+    }
+    if holds_results(folder) && !options.resume && !options.force {
+        return Err(SssError::Exists(folder.to_owned()));
+    }
+    let whole = open_capture(&options.capture, &config)?;
+    whole.notes.iter().for_each(|note| events(Event::Note(note.clone())));
+    check_images(&whole)?;
+    let capture = whole.select(&options.views, &options.lights)?;
+    let capture_hash = whole.hash()?;
+    std::fs::create_dir_all(folder).map_err(SssError::io(folder, "create the folder"))?;
+    if options.force {
+        clear(folder)?;
+    }
+    let resumed = options.resume && Reconstruction::has_checkpoint(&checkpoint);
+    let mut costs = Costs::default();
+    let mut training = if resumed {
+        costs = crate::output_file::read_json(&checkpoint.join(COSTS_FILE), "costs").unwrap_or_default();
+        Reconstruction::resume(capture.clone(), &config, &checkpoint)?
+    } else {
+        if options.resume {
+            events(Event::Note(format!("{}: no checkpoint, starting anew", checkpoint.display())));
+        }
+        Reconstruction::new(capture.clone(), &config)?
+    };
+    let mut log = match resumed {
+        true => TrainingLog::read_until(&folder.join("log.csv"), config.steps, training.steps_done()),
+        false => TrainingLog::new(config.steps),
+    };
+    let mut record = record_of(options, &config, &capture, capture_hash.clone());
+    record.write(folder)?;
+    events(Event::Note(format!("first Gaussians: {}", training.initial_origin)));
+    events(Event::Started { done: training.steps_done(), steps: config.steps, images: training.pair_count() });
+    let earlier = costs.clone();
+    let spent = |training: &Reconstruction| Costs {
+        seconds: earlier.seconds + begun.elapsed().as_secs_f64(),
+        peak_bytes: peak_bytes().max(earlier.peak_bytes),
+        profile: add_profiles(&earlier.profile, &training.profile()),
+    };
+    let save = |training: &mut Reconstruction, log: &TrainingLog| -> Result<(), SssError> {
+        log.write(&folder.join("log.csv"))?;
+        training.save_checkpoint(&checkpoint)?;
+        write_json(&checkpoint.join(COSTS_FILE), &spent(training))
+    };
+    while !training.finished() {
+        let report = training.step()?;
+        log.push(&report);
+        events(Event::Step { report: &report, psnr: log.running_psnr().unwrap_or(0.0) });
+        let stop = interrupted.load(Ordering::SeqCst);
+        if training.checkpoint_due() || training.finished() || stop {
+            log.flush();
+            save(&mut training, &log)?;
+            events(Event::Checkpoint { step: training.steps_done() });
+        }
+        if stop && !training.finished() {
+            return Err(SssError::Interrupted { step: training.steps_done(), folder: folder.to_owned() });
+        }
+    }
+    training.model()?.save(folder)?;
+    let now = spent(&training);
+    write_profile(folder, config.steps, &now)?;
+    let model = training.model()?;
+    let scores = evaluate_with(model, &capture, |done, all, _| {
+        events(Event::Evaluated { done, all });
+        Ok(())
+    })?;
+    let seconds = earlier.seconds + begun.elapsed().as_secs_f64();
+    let peak = peak_bytes().max(earlier.peak_bytes);
+    record.seconds = Some(seconds);
+    record.peak_bytes = peak;
+    record.write(folder)?;
+    let metrics = Metrics {
+        scores,
+        capture_hash,
+        seconds: Some(seconds),
+        peak_bytes: peak,
+        seed: config.seed,
+        preset: options.preset.clone(),
+        steps: config.steps,
+        gaussians: model.len(),
+        trained_on: None,
+    };
+    metrics.write(folder)?;
+    write_report(folder, model, &capture, &metrics, &record, &log)?;
+    Ok(Outcome { gaussians: model.len(), metrics: Some(metrics), seconds })
+}
+
+fn record_of(options: &ReconstructOptions, config: &Config, capture: &Capture, capture_hash: String) -> RunRecord {
+    RunRecord {
+        version: env!("CARGO_PKG_VERSION").into(),
+        command: options.command.clone(),
+        capture: capture.root.clone(),
+        capture_hash,
+        views: options.views.to_string(),
+        lights: options.lights.to_string(),
+        preset: options.preset.clone(),
+        steps: config.steps,
+        seed: config.seed,
+        threads: rayon::current_num_threads(),
+        training_images: capture.train.iter().map(|v| v.shots.len()).sum(),
+        up: RunRecord::up_of(capture).into(),
+        cameras: capture.train.iter().map(|v| StoredCamera::of(&v.name, &v.camera)).collect(),
+        rig: RunRecord::rig_of(capture).iter().map(StoredLight::of).collect(),
+        seconds: None,
+        peak_bytes: None,
+    }
+}
+
+fn add_profiles(earlier: &[(String, f64)], now: &[(&'static str, f64)]) -> Vec<(String, f64)> {
+    let mut out = earlier.to_vec();
+    for (name, seconds) in now {
+        match out.iter_mut().find(|(n, _)| n == name) {
+            Some((_, s)) => *s += seconds,
+            None => out.push(((*name).to_owned(), *seconds)),
+        }
+    }
+    out
+}
+
+fn write_profile(folder: &Path, steps: u64, costs: &Costs) -> Result<(), SssError> {
+    let in_steps: f64 = costs.profile.iter().map(|(_, s)| s).sum();
+    let parts: serde_json::Map<String, serde_json::Value> =
+        costs.profile.iter().map(|(name, s)| (name.clone(), (*s).into())).collect();
+    let value = serde_json::json!({
+        "seconds": parts,
+        "seconds_in_steps": in_steps,
+        "seconds_total": costs.seconds,
+        "steps": steps,
+        "steps_per_second": if in_steps > 0.0 { Some(steps as f64 / in_steps) } else { None },
+        "peak_bytes": costs.peak_bytes,
+    });
+    write_json(&folder.join("profile.json"), &value)
+}
