@@ -8,6 +8,7 @@ pub mod density;
 mod ellipse;
 mod error;
 mod gaussians;
+mod hull;
 mod lanes;
 mod neighbours;
 mod ply;
@@ -20,6 +21,7 @@ mod visibility;
 pub use config::{Cutoff, RasterConfig};
 pub use error::SplatError;
 pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
+pub use hull::{Hull, HullConfig, scene_bounds_from_masks, visual_hull};
 pub use neighbours::mean_squared_distance_to_nearest;
 pub use ply::{
     PlyColumn, PlyFormat, PlyTable, PointCloud, SH_DC, ScalarType, SplatPly, parse_ply, ply_bytes, read_ply, write_ply,

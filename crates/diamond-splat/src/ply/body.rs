@@ -213,7 +213,7 @@ impl<'a> Text<'a> {
         // Each value takes a digit and a separator, but for the last.
         let left = self.bytes.len() - self.at;
         let least = vertex.count.checked_mul(vertex.properties.len()).and_then(|n| n.checked_mul(2));
-        if !least.is_some_and(|n| n <= left + 1) {
+        if least.is_none_or(|n| n > left + 1) {
             return Err(malformed(
                 Place::Line(self.next_line),
                 format!(
