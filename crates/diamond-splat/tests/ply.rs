@@ -399,6 +399,19 @@ fn activations_are_inverted() {
     }
 }
 
+/// The point cloud of the example capture: a scanner's kind of file, with byte colours.
+#[test]
+fn the_example_capture_is_read() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/captures/spot-small/points3d.ply");
+    let cloud = PointCloud::read(path).unwrap();
+    assert!(cloud.positions.len() > 100);
+    let (normals, colors) = (cloud.normals.unwrap(), cloud.colors.unwrap());
+    assert_eq!((normals.len(), colors.len()), (cloud.positions.len(), cloud.positions.len()));
+    assert!(normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3));
+    assert!(cloud.positions.iter().all(|p| p.length() < 10.0));
+    assert!(colors.iter().any(|c| c.max_element() > 0.05));
+}
+
 #[test]
 fn point_clouds_are_read_with_colours_of_any_type() {
     let body = |kind: &str, red: &str| {
