@@ -1,5 +1,6 @@
 //! A capture: views, the shots of each view, and where everything lies.
 use crate::cache::ImageCache;
+use crate::exclusions::{Exclusions, strip_png};
 use crate::frames::{Frame, Frames, Lens};
 use crate::{DatasetError, Place, folder};
 use diamond_camera::{Camera, Intrinsics};
@@ -251,59 +252,6 @@ fn find_train(path: &Path) -> Result<(PathBuf, PathBuf, bool), DatasetError> {
         TRAIN_JSON => Ok((root, path.to_path_buf(), false)),
         "transforms_test.json" | "transforms_eval.json" => find_train(&root),
         _ => Ok((root, path.to_path_buf(), true)),
-    }
-}
-
-/// `exclude_list.txt`.
-struct Exclusions {
-    names: BTreeSet<String>,
-    used: std::cell::RefCell<BTreeSet<String>>,
-}
-
-/// The largest exclude list that is read, bytes.
-const MAX_EXCLUDE_BYTES: u64 = 64 << 20;
-
-/// A path with `/` between its parts and without a leading `./` and a trailing `.png`.
-fn plain_name(path: &str) -> String {
-    let unified = path.trim().replace('\\', "/");
-    let bare = unified.trim_start_matches("./");
-    strip_png(bare).to_string()
-}
-
-fn strip_png(name: &str) -> &str {
-    let cut = name.len().saturating_sub(4);
-    match name.is_char_boundary(cut) && name[cut..].eq_ignore_ascii_case(".png") {
-        true => &name[..cut],
-        false => name,
-    }
-}
-
-impl Exclusions {
-    fn read(root: &Path, documents: &mut Vec<PathBuf>) -> Result<Self, DatasetError> {
-        let path = root.join("exclude_list.txt");
-        let mut names = BTreeSet::new();
-        if path.is_file() {
-            let text = folder::read_text(&path, MAX_EXCLUDE_BYTES, "read the list of excluded images")?;
-            names.extend(text.lines().map(|l| plain_name(l.split('#').next().unwrap_or(""))).filter(|n| !n.is_empty()));
-            documents.push(path);
-        }
-        Ok(Self { names, used: Default::default() })
-    }
-
-    fn contains(&self, written: &str) -> bool {
-        let full = plain_name(written);
-        let stem = full.rsplit('/').next().unwrap_or_default().to_string();
-        let hit = [full, stem].into_iter().find(|name| self.names.contains(name));
-        let found = hit.is_some();
-        self.used.borrow_mut().extend(hit);
-        found
-    }
-
-    fn note_unused(&self, notes: &mut Vec<String>) {
-        let used = self.used.borrow();
-        for name in self.names.iter().filter(|name| !used.contains(*name)) {
-            notes.push(format!("exclude_list.txt: \"{name}\" names no image of this capture"));
-        }
     }
 }
 

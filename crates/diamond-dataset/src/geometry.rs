@@ -16,6 +16,11 @@ const ADVICE: &str =
     "write channels depth.z, normal.x, normal.y and normal.z, as large as the view, or remove the file";
 
 impl View {
+    /// Whether there is a file of true geometry for this view.
+    pub fn has_ground_truth_geometry(&self) -> bool {
+        self.geometry.is_some()
+    }
+
     /// The true geometry of this view, from `geometry/<train|test>_<view name>.exr` in the capture's folder (channels
     /// `depth.z`, `normal.x`, `normal.y`, `normal.z`); `None` where there is no such file.
     ///

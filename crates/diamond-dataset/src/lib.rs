@@ -8,9 +8,21 @@
 //! Invariant: nothing here knows of Gaussians, shading or losses; whatever the bytes on disk, the answer is a value or
 //! a [`DatasetError`] that names file, frame and field, never a panic, and memory stays within the limits of
 //! [`OpenOptions`].
+//!
+//! ```
+//! use diamond_dataset::{Capture, OpenOptions, Selection};
+//! # let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/captures/spot-small");
+//! let capture = Capture::open(&path, &OpenOptions::default())?;
+//! let sparse = capture.select(&Selection::Count(3), &"0,2-3".parse()?)?;
+//! assert_eq!((sparse.train.len(), sparse.train[0].shots.len(), sparse.test.len()), (3, 3, 4));
+//! let observation = sparse.observation(&sparse.train[0].shots[0])?;
+//! assert_eq!(observation.radiance.shape(), (128, 128, 3));
+//! # Ok::<(), diamond_dataset::DatasetError>(())
+//! ```
 mod cache;
 mod capture;
 mod error;
+mod exclusions;
 mod field;
 mod folder;
 mod frames;
@@ -26,6 +38,6 @@ pub use capture::{AlphaPremultiplied, Capture, EvalSplit, OpenOptions, Provenanc
 pub use error::{DatasetError, Place};
 pub use geometry::Geometry;
 pub use observation::{Observation, to_display};
-pub use scene::Scene;
+pub use scene::{Scene, light_direction};
 pub use select::{Selection, farthest_points};
 pub use write::{BitDepth, CaptureDescription, Pixels, ShotDescription, ViewDescription, write_capture};

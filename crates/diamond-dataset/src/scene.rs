@@ -50,7 +50,7 @@ fn angle(a: Vec3, b: Vec3) -> f32 {
 }
 
 /// Unit direction from `centre` to a light; +z where the light is at the centre.
-pub(crate) fn light_direction(light: &OlatLight, centre: Vec3) -> Vec3 {
+pub fn light_direction(light: &OlatLight, centre: Vec3) -> Vec3 {
     match *light {
         OlatLight::Point { position, .. } => (position - centre).try_normalize().unwrap_or(Vec3::Z),
         OlatLight::Directional { direction, .. } => direction.try_normalize().unwrap_or(Vec3::Z),
@@ -85,7 +85,8 @@ fn nearest_to_axes(centres: &[Vec3], axes: &[Vec3]) -> Option<Vec3> {
     let mut normal = DMat3::IDENTITY * (ORIGIN_WEIGHT * centres.len().max(1) as f64);
     let mut right = DVec3::ZERO;
     for (centre, axis) in centres.iter().zip(axes) {
-        let d = axis.as_dvec3();
+        // Unit to rounding in f64, else what is lost in f32 outweighs the origin.
+        let d = axis.as_dvec3().normalize_or(DVec3::Z);
         let projector = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         normal += projector;
         right += projector * centre.as_dvec3();

@@ -1,6 +1,6 @@
 //! Choosing a few views and lights of a capture, evenly and reproducibly.
 use crate::scene::light_direction;
-use crate::{Capture, DatasetError, Shot, View};
+use crate::{Capture, DatasetError, Shot, Split, View};
 use diamond_light::OlatLight;
 use glam::Vec3;
 use std::collections::BTreeMap;
@@ -180,6 +180,14 @@ impl Capture {
     }
 }
 
+impl Capture {
+    /// The lights of a split in the order in which they first appear, if all its views share one rig: together they have
+    /// no more different lights than the fullest view alone. `None` on a turntable, and for a split without views.
+    pub fn shared_rig(&self, split: Split) -> Option<Vec<OlatLight>> {
+        shared_rig(self.views(split)).filter(|rig| !rig.is_empty())
+    }
+}
+
 fn spread_lights(view: &mut View, count: usize, centre: Vec3) {
     let directions: Vec<Vec3> = view.shots.iter().map(|shot| light_direction(&shot.light, centre)).collect();
     view.shots = farthest_points(&directions, count).into_iter().map(|i| view.shots[i].clone()).collect();
@@ -229,8 +237,8 @@ fn key(light: &OlatLight) -> LightKey {
     (point, v.to_array().map(|x| (x + 0.0).to_bits()))
 }
 
-/// The lights of the rig, in the order in which they first appear, if all views share one.
-pub(crate) fn shared_rig(views: &[View]) -> Option<Vec<OlatLight>> {
+/// See [`Capture::shared_rig`].
+fn shared_rig(views: &[View]) -> Option<Vec<OlatLight>> {
     let mut lights = Vec::new();
     let mut seen = BTreeMap::new();
     for shot in views.iter().flat_map(|view| &view.shots) {

@@ -29,6 +29,10 @@ fn the_example_capture() {
     let seen: Vec<bool> = capture.test[0].shots.iter().map(|shot| without.is_seen_light(&shot.light)).collect();
     assert_eq!(seen, [true, false, false, false]);
 
+    // One camera alone: the point of its axis nearest to the origin.
+    let alone = capture.select(&Selection::Count(1), &Selection::All).unwrap().scene();
+    assert!(alone.centre.length() < 1e-2 && (alone.camera_extent - 4.0).abs() < 1e-2, "{alone:?}");
+
     let shot = &capture.test[2].shots[0];
     let observation = capture.observation(shot).unwrap();
     let file = image::open(&shot.path).unwrap().to_rgb8().into_raw();

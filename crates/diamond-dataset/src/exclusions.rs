@@ -1,0 +1,61 @@
+//! `exclude_list.txt`: images of a capture that are left out.
+use crate::{DatasetError, folder};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// The names in `exclude_list.txt`, and which of them were met.
+pub(crate) struct Exclusions {
+    names: BTreeSet<String>,
+    used: std::cell::RefCell<BTreeSet<String>>,
+}
+
+/// The largest exclude list that is read, bytes.
+const MAX_EXCLUDE_BYTES: u64 = 64 << 20;
+
+/// A path with `/` between its parts and without a leading `./` and a trailing `.png`.
+fn plain_name(path: &str) -> String {
+    let unified = path.trim().replace('\\', "/");
+    let bare = unified.trim_start_matches("./");
+    strip_png(bare).to_string()
+}
+
+/// A name without a trailing `.png`, in whatever case.
+pub(crate) fn strip_png(name: &str) -> &str {
+    let cut = name.len().saturating_sub(4);
+    match name.is_char_boundary(cut) && name[cut..].eq_ignore_ascii_case(".png") {
+        true => &name[..cut],
+        false => name,
+    }
+}
+
+impl Exclusions {
+    /// Reads the list of a folder, if there is one, and adds it to the documents.
+    pub(crate) fn read(root: &Path, documents: &mut Vec<PathBuf>) -> Result<Self, DatasetError> {
+        let path = root.join("exclude_list.txt");
+        let mut names = BTreeSet::new();
+        if path.is_file() {
+            let text = folder::read_text(&path, MAX_EXCLUDE_BYTES, "read the list of excluded images")?;
+            names.extend(text.lines().map(|l| plain_name(l.split('#').next().unwrap_or(""))).filter(|n| !n.is_empty()));
+            documents.push(path);
+        }
+        Ok(Self { names, used: Default::default() })
+    }
+
+    /// Whether the image that a frame names is to be left out.
+    pub(crate) fn contains(&self, written: &str) -> bool {
+        let full = plain_name(written);
+        let stem = full.rsplit('/').next().unwrap_or_default().to_string();
+        let hit = [full, stem].into_iter().find(|name| self.names.contains(name));
+        let found = hit.is_some();
+        self.used.borrow_mut().extend(hit);
+        found
+    }
+
+    /// Notes names that were never met.
+    pub(crate) fn note_unused(&self, notes: &mut Vec<String>) {
+        let used = self.used.borrow();
+        for name in self.names.iter().filter(|name| !used.contains(*name)) {
+            notes.push(format!("exclude_list.txt: \"{name}\" names no image of this capture"));
+        }
+    }
+}
