@@ -140,10 +140,9 @@ mod tests {
             read_cameras(&path)
         };
         let matrix = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]";
-        let one = read(&format!(
-            r#"{{"camera_angle_x":1.0,"w":64,"h":48,"frames":[{{"transform_matrix":{matrix}}}]}}"#
-        ))
-        .unwrap();
+        let one =
+            read(&format!(r#"{{"camera_angle_x":1.0,"w":64,"h":48,"frames":[{{"transform_matrix":{matrix}}}]}}"#))
+                .unwrap();
         assert_eq!((one.len(), one[0].intrinsics.width, one[0].pose.centre()), (1, 64, Vec3::new(0.0, 0.0, 4.0)));
         for (text, word) in [
             ("{", "JSON"),

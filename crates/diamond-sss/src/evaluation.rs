@@ -86,11 +86,8 @@ pub(crate) fn evaluate_with(
             let (render, truth) = (as_image(&bytes)?, as_image(&observation.display)?);
             let (similarity, _) = ssim(&render, &truth, SsimWindow::ZeroPadded)?;
             let flip = flip_ldr(&truth, &render, FlipOptions::default())?;
-            let all = Scored {
-                psnr: psnr(&render, &truth, 1.0)?.min(PSNR_CAP),
-                ssim: similarity.mean,
-                flip: flip.mean,
-            };
+            let all =
+                Scored { psnr: psnr(&render, &truth, 1.0)?.min(PSNR_CAP), ssim: similarity.mean, flip: flip.mean };
             let masked = match observation.mask.as_ref().and_then(foreground) {
                 Some(mask) => Some(Scored {
                     psnr: psnr_masked(&render, &truth, &mask, 1.0)?.min(PSNR_CAP),

@@ -69,12 +69,15 @@ pub struct Metrics {
 impl Metrics {
     /// Summary of the images that `keep` keeps, over all pixels or inside the masks.
     pub fn summary(&self, masked: bool, keep: impl Fn(&ImageScore) -> bool) -> Option<Summary> {
-        Summary::of(
-            self.scores.iter().filter(|s| keep(s)).filter_map(|s| if masked { s.masked } else { Some(s.all) }),
-        )
+        Summary::of(self.scores.iter().filter(|s| keep(s)).filter_map(|s| if masked { s.masked } else { Some(s.all) }))
     }
 
-    fn group(&self, path: &str, keep: &dyn Fn(&ImageScore) -> bool, absent: &mut Map<String, Value>) -> Map<String, Value> {
+    fn group(
+        &self,
+        path: &str,
+        keep: &dyn Fn(&ImageScore) -> bool,
+        absent: &mut Map<String, Value>,
+    ) -> Map<String, Value> {
         let mut out = self.values(path, self.summary(false, keep), self.reason(keep, false), absent);
         let inner = if path.is_empty() { "masked".to_owned() } else { format!("{path}.masked") };
         let masked = self.values(&inner, self.summary(true, keep), self.reason(keep, true), absent);
@@ -302,15 +305,8 @@ mod tests {
     #[test]
     fn what_is_absent_is_null_and_says_why() {
         let one = Scored { psnr: PSNR_CAP, ssim: 1.0, flip: 0.0 };
-        let score = ImageScore {
-            name: "a".into(),
-            view: 0,
-            shot: 0,
-            size: (8, 4),
-            seen_light: true,
-            all: one,
-            masked: None,
-        };
+        let score =
+            ImageScore { name: "a".into(), view: 0, shot: 0, size: (8, 4), seen_light: true, all: one, masked: None };
         let json = metrics(vec![score]).to_json();
         assert_eq!(json["psnr"], 150.0);
         assert_eq!(json["resolution"], json!([8, 4]));

@@ -61,8 +61,7 @@ fn run(command: Command) -> Result<(), SssError> {
             print(&diamond_sss::inspect_text(&capture));
             if let Some(path) = output {
                 let picture = diamond_sss::inspect_picture(&capture)?;
-                let bytes: Vec<u8> =
-                    picture.data().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+                let bytes: Vec<u8> = picture.data().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
                 let png = diamond_sss::encode_png_rgb(&bytes, picture.width(), picture.height())?;
                 diamond_sss::write_output(&path, &png)?;
                 print(&format!("written: {}\n", path.display()));

@@ -125,8 +125,19 @@ const COSTS_FILE: &str = "costs.json";
 
 /// Files and folders that a run writes; `--force` removes these and nothing else.
 const RESULTS: [&str; 13] = [
-    "model.ply", "config.toml", "scene.toml", "network.safetensors", "metrics.json", "metrics.csv", "report.html",
-    "log.csv", "profile.json", "run.json", "checkpoint/state.safetensors", "checkpoint/costs.json", "images",
+    "model.ply",
+    "config.toml",
+    "scene.toml",
+    "network.safetensors",
+    "metrics.json",
+    "metrics.csv",
+    "report.html",
+    "log.csv",
+    "profile.json",
+    "run.json",
+    "checkpoint/state.safetensors",
+    "checkpoint/costs.json",
+    "images",
 ];
 
 fn clear(folder: &Path) -> Result<(), SssError> {

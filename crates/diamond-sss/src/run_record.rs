@@ -1,7 +1,7 @@
 //! What a run was asked for and what it learned from: `run.json`. Later commands need it to tell seen from unseen
 //! lights, and to render without the capture.
-use crate::output_file::{read_json, write_json};
 use crate::SssError;
+use crate::output_file::{read_json, write_json};
 use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_dataset::Capture;
 use diamond_light::OlatLight;

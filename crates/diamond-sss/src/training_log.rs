@@ -58,9 +58,7 @@ impl TrainingLog {
         }
         let n = self.pending.len() as f64;
         let mean = |f: &dyn Fn(&StepReport) -> f64| self.pending.iter().map(f).sum::<f64>() / n;
-        let term = |name: &str| {
-            mean(&|r| r.terms.iter().find(|t| t.name == name).map_or(0.0, |t| f64::from(t.value)))
-        };
+        let term = |name: &str| mean(&|r| r.terms.iter().find(|t| t.name == name).map_or(0.0, |t| f64::from(t.value)));
         self.rows.push(LogRow {
             step: last.step + 1,
             objective: mean(&|r| f64::from(r.objective)),
@@ -81,7 +79,10 @@ impl TrainingLog {
 
     /// The log as CSV.
     pub fn to_csv(&self) -> String {
-        let mut out = format!("step,objective,psnr,gaussians{}\n", self.terms.iter().map(|t| format!(",{t}")).collect::<String>());
+        let mut out = format!(
+            "step,objective,psnr,gaussians{}\n",
+            self.terms.iter().map(|t| format!(",{t}")).collect::<String>()
+        );
         for row in &self.rows {
             out += &format!("{},{},{},{}", row.step, row.objective, row.psnr, row.gaussians);
             for k in 0..self.terms.len() {

@@ -5,8 +5,12 @@ use std::path::PathBuf;
 
 /// Reconstructs translucent objects from photographs under one light at a time, and shows them under any light.
 #[derive(Debug, Parser)]
-#[command(name = "diamond", version, after_help = "Exit codes: 0 done, 1 the run failed, 2 usage, 3 bad input (capture, \
-configuration, model files), 130 interrupted.\nSet DIAMOND_LOG=debug for more messages.")]
+#[command(
+    name = "diamond",
+    version,
+    after_help = "Exit codes: 0 done, 1 the run failed, 2 usage, 3 bad input (capture, \
+configuration, model files), 130 interrupted.\nSet DIAMOND_LOG=debug for more messages."
+)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
@@ -41,7 +45,9 @@ pub enum Command {
         output: Option<PathBuf>,
     },
     /// Write the Gaussians for other programs
-    #[command(after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials")]
+    #[command(
+        after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials"
+    )]
     Export {
         /// Folder of a finished reconstruction
         dir: PathBuf,

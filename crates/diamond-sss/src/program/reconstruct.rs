@@ -43,9 +43,9 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
             let from = if done > 0 { format!(", continuing after step {done}") } else { String::new() };
             training.say(&format!("{steps} steps on {images} images{from}"));
         }
-        Event::Step { report, psnr } => training.show_with(report.step + 1, all, || {
-            format!("PSNR {psnr:.2} dB, {} Gaussians", report.gaussians)
-        }),
+        Event::Step { report, psnr } => {
+            training.show_with(report.step + 1, all, || format!("PSNR {psnr:.2} dB, {} Gaussians", report.gaussians))
+        }
         Event::Checkpoint { step } if step == all => training.finish(),
         Event::Checkpoint { step } => tracing::debug!("checkpoint after step {step}"),
         Event::Evaluated { done, all } => evaluating.show(done, all),

@@ -13,7 +13,16 @@ fn tick(span: f64) -> f64 {
     let raw = (span / 4.0).max(1e-12);
     let power = 10f64.powf(raw.log10().floor());
     let lead = raw / power;
-    power * if lead <= 1.0 { 1.0 } else if lead <= 2.0 { 2.0 } else if lead <= 5.0 { 5.0 } else { 10.0 }
+    power
+        * if lead <= 1.0 {
+            1.0
+        } else if lead <= 2.0 {
+            2.0
+        } else if lead <= 5.0 {
+            5.0
+        } else {
+            10.0
+        }
 }
 
 fn label(v: f64) -> String {
@@ -53,7 +62,12 @@ pub fn chart(title: &str, unit: &str, points: &[(f64, f64)], from_zero: bool) ->
             out,
             "<line class=\"grid\" x1=\"{LEFT}\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\"/>\
              <text class=\"y\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
-            WIDTH - RIGHT, y(v), y(v), LEFT - 7.0, y(v) + 4.0, label(v)
+            WIDTH - RIGHT,
+            y(v),
+            y(v),
+            LEFT - 7.0,
+            y(v) + 4.0,
+            label(v)
         );
     }
     let across = tick(end).max(1.0);
@@ -66,7 +80,9 @@ pub fn chart(title: &str, unit: &str, points: &[(f64, f64)], from_zero: bool) ->
     let _ = write!(
         out,
         "<polyline points=\"{}\"/><circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\"/></svg></figure>",
-        path.join(" "), x(last_x), y(last_y)
+        path.join(" "),
+        x(last_x),
+        y(last_y)
     );
     out
 }
@@ -74,10 +90,7 @@ pub fn chart(title: &str, unit: &str, points: &[(f64, f64)], from_zero: bool) ->
 /// Means over neighbours, so that at most `count` points remain and single steps do not hide the course.
 pub fn smooth(points: &[(f64, f64)], count: usize) -> Vec<(f64, f64)> {
     let size = points.len().div_ceil(count.max(1)).max(1);
-    points
-        .chunks(size)
-        .map(|c| (c[c.len() - 1].0, c.iter().map(|p| p.1).sum::<f64>() / c.len() as f64))
-        .collect()
+    points.chunks(size).map(|c| (c[c.len() - 1].0, c.iter().map(|p| p.1).sum::<f64>() / c.len() as f64)).collect()
 }
 
 #[cfg(test)]

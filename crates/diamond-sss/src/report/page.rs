@@ -29,8 +29,7 @@ pub fn write_report(
     record: &RunRecord,
     log: &TrainingLog,
 ) -> Result<(), SssError> {
-    let (views, held_out) =
-        if capture.test.is_empty() { (&capture.train, false) } else { (&capture.test, true) };
+    let (views, held_out) = if capture.test.is_empty() { (&capture.train, false) } else { (&capture.test, true) };
     let Some(view) = views.first() else { return Err(SssError::Internal("a capture without views".into())) };
     let mut body = String::new();
     headline(&mut body, metrics);
@@ -148,7 +147,10 @@ fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool)
             let psnr = diamond_metrics::psnr(&a, &b, 1.0)?.min(crate::PSNR_CAP);
             let seen = if capture.is_seen_light(&shot.light) { "seen light" } else { "unseen light" };
             let picture = |png: Vec<u8>, caption: &str| {
-                format!("<figure><img alt=\"{caption}\" src=\"{}\"><figcaption>{caption}</figcaption></figure>", data_uri(&png))
+                format!(
+                    "<figure><img alt=\"{caption}\" src=\"{}\"><figcaption>{caption}</figcaption></figure>",
+                    data_uri(&png)
+                )
             };
             out += &format!(
                 "<div class=\"row\">{}{}{}<p><b>{}</b><br>{seen}<br>{psnr:.2} dB<br>FLIP {:.4}</p></div>",

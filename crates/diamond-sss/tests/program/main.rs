@@ -1,0 +1,131 @@
+//! The built program, from the outside: files, exit codes, messages, and a real `kill -9`.
+mod bad_input;
+mod captures;
+
+use captures::{scratch, small_config, tiny_capture};
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn diamond(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_diamond")).args(arguments).output().unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn succeed(arguments: &[&str]) -> Output {
+    let output = diamond(arguments);
+    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+    output
+}
+
+#[test]
+fn from_capture_to_report_and_pictures() {
+    let dir = scratch("end-to-end");
+    let (capture, out, config) = (dir.join("capture"), dir.join("out"), small_config(&dir));
+    tiny_capture(&capture, 3, 2);
+    let run = ["reconstruct", text(&capture), "-o", text(&out), "--preset", text(&config), "--steps", "6"];
+    let first = succeed(&run);
+    assert!(String::from_utf8_lossy(&first.stdout).contains("report.html"));
+    for name in [
+        "model.ply",
+        "config.toml",
+        "scene.toml",
+        "network.safetensors",
+        "metrics.json",
+        "metrics.csv",
+        "report.html",
+        "log.csv",
+        "profile.json",
+        "run.json",
+        "checkpoint/state.safetensors",
+    ] {
+        assert!(out.join(name).is_file(), "{name}");
+    }
+    let page = std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(!page.contains("http://") || !page.contains("src=\"http"), "the report must need no network");
+    let log = std::fs::read_to_string(out.join("log.csv")).unwrap();
+    assert_eq!(log.lines().count(), 7);
+
+    let refused = diamond(&run);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(stderr(&refused).contains("--resume") && stderr(&refused).contains("--force"));
+    succeed(&[&run[..], &["--force"]].concat());
+    succeed(&[&run[..], &["--resume"]].concat());
+
+    let printed = succeed(&["evaluate", text(&out), text(&capture), "--save-images"]);
+    assert!(String::from_utf8_lossy(&printed.stdout).contains("unseen lights"));
+    assert_eq!(std::fs::read_dir(out.join("images")).unwrap().count(), 6);
+    let metrics: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(out.join("metrics.json")).unwrap()).unwrap();
+    for group in [&metrics, &metrics["masked"], &metrics["seen_lights"], &metrics["unseen_lights"]] {
+        for key in ["psnr", "ssim", "flip", "psnr_std", "ssim_std", "flip_std"] {
+            assert!(group[key].is_number(), "{key} in {group}");
+        }
+        assert!(group["lpips_vgg"].is_null() && group["lpips_alex"].is_null());
+    }
+    for key in ["images", "seconds", "peak_bytes", "seed"] {
+        assert!(metrics[key].is_number(), "{key}");
+    }
+    assert_eq!(metrics["images"], 2);
+    assert_eq!(metrics["resolution"], serde_json::json!([32, 32]));
+    assert!(metrics["absent"]["lpips_vgg"].is_string());
+    assert_eq!(metrics["capture_hash"].as_str().unwrap().len(), 64);
+
+    let picture = dir.join("a.png");
+    succeed(&["render", text(&out), "-o", text(&picture), "--light", "-1,2,3", "--size", "40x24"]);
+    assert_eq!(image::image_dimensions(&picture).unwrap(), (40, 24));
+    succeed(&["render", text(&out), "-o", text(&dir.join("film")), "--orbit", "3", "--direction", "0,0,1"]);
+    assert_eq!(std::fs::read_dir(dir.join("film")).unwrap().count(), 3);
+    succeed(&["render", text(&out), "-o", text(&dir.join("rig")), "--capture", text(&capture), "--lights", "4"]);
+    assert_eq!(std::fs::read_dir(dir.join("rig")).unwrap().count(), 4);
+    succeed(&["render", text(&out), "-o", text(&dir.join("m.exr")), "--linear", "--mix", "0,0,4:1,0,0;4,0,0:0,1,0"]);
+    let too_many = diamond(&["render", text(&out), "-o", text(&picture), "--orbit", "3"]);
+    assert_eq!(too_many.status.code(), Some(2));
+    succeed(&["export", text(&out), "-o", text(&dir.join("x.ply")), "--materials"]);
+    assert!(std::fs::read(dir.join("x.ply")).unwrap().starts_with(b"ply\n"));
+    succeed(&["inspect", text(&capture), "-o", text(&dir.join("overview.png"))]);
+    succeed(&["presets", "paper"]);
+    assert_eq!(diamond(&["presets", "no-such"]).status.code(), Some(3));
+    assert_eq!(diamond(&["reconstruct"]).status.code(), Some(2));
+    assert_eq!(diamond(&["evaluate", text(&dir.join("nothing")), text(&capture)]).status.code(), Some(3));
+    std::fs::remove_dir_all(dir).unwrap();
+}
+
+#[test]
+fn killed_and_resumed_gives_the_same_bits() {
+    let dir = scratch("kill");
+    let (capture, config) = (dir.join("capture"), small_config(&dir));
+    tiny_capture(&capture, 3, 2);
+    let (whole, killed) = (dir.join("whole"), dir.join("killed"));
+    let arguments = |out: &Path| -> Vec<String> {
+        let words = ["reconstruct", text(&capture), "-o", text(out), "--preset", text(&config), "--steps", "60"];
+        words.iter().map(|s| (*s).to_owned()).collect()
+    };
+    let program = || Command::new(env!("CARGO_BIN_EXE_diamond"));
+    assert!(program().args(arguments(&whole)).output().unwrap().status.success());
+    let mut child = program().args(arguments(&killed)).stderr(std::process::Stdio::null()).spawn().unwrap();
+    let state = killed.join("checkpoint/state.safetensors");
+    for _ in 0..6000 {
+        if state.is_file() || child.try_wait().unwrap().is_some() {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    // On Unix this is SIGKILL: nothing in the program can answer it.
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(state.is_file());
+    let resumed = program().args(arguments(&killed)).arg("--resume").output().unwrap();
+    assert!(resumed.status.success(), "{}", stderr(&resumed));
+    for name in ["model.ply", "network.safetensors", "metrics.csv"] {
+        let (a, b) = (std::fs::read(whole.join(name)).unwrap(), std::fs::read(killed.join(name)).unwrap());
+        assert!(a == b, "{name} differs after kill and resume");
+    }
+    std::fs::remove_dir_all(dir).unwrap();
+}
