@@ -4,7 +4,7 @@ use diamond_camera::Camera;
 use diamond_dataset::{Capture, Observation};
 use diamond_image::Mask;
 use diamond_light::{Falloff, OlatLight};
-use diamond_splat::PointCloud;
+use diamond_splat::{HullConfig, PointCloud, scene_bounds_from_masks, visual_hull};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -102,8 +102,17 @@ fn from_hull(capture: &Capture, config: &Config) -> Result<Option<InitialPoints>
     }
     let cameras: Vec<Camera> = masks.iter().map(|(c, _)| *c).collect();
     let coverage: Vec<&Mask> = masks.iter().map(|(_, m)| m).collect();
-    let _ = (cameras, coverage); // HULL
-    return Ok(None);
+    let fail = error::stage("visual hull");
+    let Some(bounds) = scene_bounds_from_masks(&cameras, &coverage).map_err(&fail)? else { return Ok(None) };
+    let hull_config = HullConfig { resolution: config.initial.hull_resolution, ..Default::default() };
+    let hull = visual_hull(&cameras, &coverage, bounds, &hull_config).map_err(&fail)?;
+    if hull.points.is_empty() {
+        return Ok(None);
+    }
+    let cloud = PointCloud { positions: hull.points, normals: Some(hull.normals), colors: None };
+    let mut points = from_cloud(cloud, config.initial.count);
+    points.origin = format!("{} points of the visual hull of {} masks", points.positions.len(), masks.len());
+    Ok(Some(points))
 }
 
 fn uniform(centre: Vec3, radius: f32, config: &Config) -> InitialPoints {

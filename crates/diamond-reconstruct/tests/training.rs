@@ -153,3 +153,23 @@ fn one_view_one_light_and_no_mask_are_valid() {
         assert!(model.parameters.values(Attribute::Mean).iter().all(|v| v.is_finite()));
     }
 }
+
+#[test]
+fn without_points_the_hull_of_the_masks_starts_the_model() {
+    let mut config = short("resolved", 60);
+    config.initial.source = diamond_reconstruct::InitialSource::Hull;
+    config.initial.hull_resolution = 48;
+    let (scene, points) = diamond_reconstruct::survey(&capture(24, 1), &config).expect("surveys");
+    assert!(points.origin.contains("visual hull of 24 masks"), "{}", points.origin);
+    // The object lies in the unit ball round the origin.
+    assert!(scene.centre().length() < 0.2, "{scene:?}");
+    assert!(points.positions.iter().all(|p| p.length() < 1.25));
+    let mut run = Reconstruction::new(capture(6, 2), &config).expect("starts");
+    let first = run.step().expect("a step").psnr;
+    let last = (1..60).map(|_| run.step().expect("a step").psnr).last().expect("steps");
+    assert!(last > first + 1.0, "PSNR rose from {first} to {last} only");
+
+    config.initial.source = diamond_reconstruct::InitialSource::Uniform;
+    let (_, points) = diamond_reconstruct::survey(&capture(3, 1), &config).expect("surveys");
+    assert_eq!(points.positions.len(), config.initial.count);
+}
