@@ -46,8 +46,8 @@
   };
   element("circle", { r: R, class: "ring" });
   element("circle", { r: R / 2, class: "half" });
-  element("text", { x: 0, y: -R / 2 + 11 }, "90°");
-  element("text", { x: 0, y: -R + 11 }, "behind");
+  element("text", { x: 0, y: R / 2 - 5 }, "90°");
+  element("text", { x: 0, y: R - 6 }, "behind");
   const dots = lights.map((l) => { const [cx, cy] = place(l.direction); return element("circle", { cx, cy, r: 5, class: "light" }); });
   const handle = element("circle", { r: 9, class: "handle" });
   let at = lights.length ? place(lights[0].direction) : [0, 0];
