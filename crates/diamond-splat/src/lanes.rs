@@ -150,8 +150,8 @@ macro_rules! with_lanes {
 }
 pub(crate) use with_lanes;
 
-/// Width of a vector on this machine.
-pub(crate) fn vector_width() -> usize {
+/// Width of a vector of that instruction set.
+pub(crate) fn vector_width(arch: pulp::Arch) -> usize {
     struct Width;
     impl pulp::WithSimd for Width {
         type Output = usize;
@@ -160,7 +160,7 @@ pub(crate) fn vector_width() -> usize {
             S::F32_LANES
         }
     }
-    pulp::Arch::new().dispatch(Width)
+    arch.dispatch(Width)
 }
 
 #[cfg(test)]

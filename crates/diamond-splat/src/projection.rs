@@ -295,7 +295,7 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
     }
     let m = g.means[i].to_array().map(f64::from);
     let z = view.w[2][0] * m[0] + view.w[2][1] * m[1] + view.w[2][2] * m[2] + view.t[2];
-    if !(z > config.near as f64 && z < f32::MAX as f64) {
+    if !(z > config.near as f64 && z < MAX_DEPTH) {
         return None;
     }
     let lin = Linearised::new(g.means[i], g.scales[i], g.rotations[i], view);
@@ -312,15 +312,25 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
     let tau = (opacity as f64 / config.min_alpha as f64).ln().max(0.0);
     let two_tau = 2.0 * tau * (1.0 + EXTENT_SLACK) + EXTENT_SLACK;
     let splat = Splat { gaussian: i as u32, depth: z as f32, opacity, mean, cov, chol, two_tau };
-    let finite = mean.iter().chain(&cov).chain(&chol).all(|v| v.is_finite() && v.abs() < MAX_SCREEN) && det.is_finite();
+    let finite = within(&mean, MAX_MEAN) && within(&cov, MAX_COVARIANCE) && within(&chol, MAX_MEAN) && det.is_finite();
     let [ex, ey] = splat.extent();
     let (x0, x1) = Splat::pixel_range(mean[0], ex, view.size[0]);
     let (y0, y1) = Splat::pixel_range(mean[1], ey, view.size[1]);
     (finite && x0 < x1 && y0 < y1).then_some(splat)
 }
 
-/// Screen means and covariances beyond this (px, px²) are culled: their f32 copies would overflow when squared.
-const MAX_SCREEN: f64 = 1e15;
+/// Screen means beyond this (px) and covariances beyond this (px²) are culled: their f32 copies would overflow when
+/// squared.
+const MAX_MEAN: f64 = 1e15;
+const MAX_COVARIANCE: f64 = 1e30;
+
+/// Gaussians at this view-space z or farther (scene units) are culled: products with their depth would overflow.
+const MAX_DEPTH: f64 = 1e18;
+
+/// Whether all values are numbers of at most that magnitude.
+fn within(values: &[f64], largest: f64) -> bool {
+    values.iter().all(|v| v.abs() <= largest)
+}
 
 /// Cotangent of one footprint.
 #[derive(Debug, Clone, Copy, Default)]

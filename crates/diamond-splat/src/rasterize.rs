@@ -9,6 +9,7 @@ use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, Raster
 use diamond_camera::Camera;
 use diamond_image::Image;
 use glam::Vec2;
+use pulp::Arch;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -68,6 +69,8 @@ pub struct RasterPullback<'a> {
     features: &'a Features,
     rows: Rows,
     lists: Vec<TileLists>,
+    /// The instruction set of the forward pass: the reverse must see the same bits.
+    arch: Arch,
 }
 
 /// Projects and blends `[eq:splat-blend]`.
@@ -105,7 +108,7 @@ pub fn rasterize<'a>(
     config: &RasterConfig,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let projection = project(gaussians, camera, config)?;
-    blend(Cow::Owned(projection), gaussians, features)
+    blend(Cow::Owned(projection), gaussians, features, Arch::new())
 }
 
 /// [`rasterize`] with a projection that was made before, for callers that compute features of
@@ -119,13 +122,14 @@ pub fn rasterize_projected<'a>(
     gaussians: &'a Gaussians,
     features: &'a Features,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
-    blend(Cow::Borrowed(projection), gaussians, features)
+    blend(Cow::Borrowed(projection), gaussians, features, Arch::new())
 }
 
 fn blend<'a>(
     projection: Cow<'a, Projection>,
     gaussians: &'a Gaussians,
     features: &'a Features,
+    arch: Arch,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let n = gaussians.len();
     if projection.radii().len() != n {
@@ -151,7 +155,7 @@ fn blend<'a>(
         depth: Image::new(width, height, 1),
         stats: RasterStats { visible: rows.order.len(), ..Default::default() },
     };
-    let scene = scene(&projection, &rows, features);
+    let scene = scene(&projection, &rows, features, arch);
     let band = width * TILE;
     // Zero channels: every row gets an empty piece.
     let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
@@ -166,23 +170,23 @@ fn blend<'a>(
         .enumerate()
         .map(|(row, ((features, opacity), depth))| {
             let ranks = &rows.slot_rank[rows.row_start[row]..rows.row_start[row + 1]];
-            pulp::Arch::new().dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
+            arch.dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
         })
         .unzip();
     raster.stats.tile_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
     raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
     raster.stats.blended_pairs = works.iter().map(|w| w.blended).sum();
-    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists }))
+    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists, arch }))
 }
 
-fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features) -> Scene<'a> {
+fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features, arch: Arch) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
         ellipses: &rows.ellipses,
         sources: &rows.sources,
         features,
-        stride: stride(features.channels),
+        stride: stride(features.channels, arch),
         channels: features.channels,
         limits: Thresholds {
             min_alpha: config.min_alpha,
@@ -196,8 +200,8 @@ fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features) ->
 }
 
 /// Values per splat in a row's copy of the features.
-fn stride(channels: usize) -> usize {
-    (channels + 1).next_multiple_of(vector_width().max(2 * GROUP))
+fn stride(channels: usize, arch: Arch) -> usize {
+    (channels + 1).next_multiple_of(vector_width(arch).max(2 * GROUP))
 }
 
 impl RasterPullback<'_> {
@@ -216,14 +220,14 @@ impl RasterPullback<'_> {
         check(&d.features, (width, height, self.features.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
-        let scene = scene(&self.projection, &self.rows, self.features);
+        let scene = scene(&self.projection, &self.rows, self.features, self.arch);
         let rows: Vec<RowGrad> = self
             .lists
             .par_iter()
             .enumerate()
             .map(|(row, lists)| {
                 let pixels = row * TILE * width..height.min((row + 1) * TILE) * width;
-                pulp::Arch::new().dispatch(RowBackward {
+                self.arch.dispatch(RowBackward {
                     scene: &scene,
                     row,
                     lists,
@@ -241,7 +245,7 @@ impl RasterPullback<'_> {
     fn gather(&self, parts: &[RowGrad]) -> RasterPull {
         let n = self.gaussians.len();
         let channels = self.features.channels;
-        let stride = stride(channels);
+        let stride = stride(channels, self.arch);
         let splats = &self.projection.splats;
         // By rank first: consecutive ranks read consecutive slots of every row.
         let mut features = vec![0.0f32; splats.len() * stride];
@@ -334,4 +338,52 @@ fn check(image: &Image, shape: (usize, usize, usize), what: &'static str) -> Res
     }
     let index = image.data().iter().position(|v| !v.is_finite()).unwrap_or(0);
     Err(SplatError::NonFinite { what, index })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_camera::{Intrinsics, Pose};
+    use glam::{Quat, Vec3};
+
+    /// The vector kernels against the same kernels on one lane at a time.
+    #[test]
+    fn instruction_sets_agree() {
+        let mut g = Gaussians::default();
+        let mut features = Features { channels: 5, data: Vec::new() };
+        for i in 0..400u32 {
+            let r = |k: u32| ((i * 13 + k) as f32 * 0.618_034).fract();
+            let mean = Vec3::new(r(0) - 0.5, r(1) - 0.5, 0.6 + r(2));
+            let scale = Vec3::new(0.004 + 0.1 * r(3), 0.004 + 0.05 * r(4), 0.01);
+            g.push(mean, scale, Quat::from_xyzw(r(5) - 0.5, r(6) - 0.5, r(7), 0.3), 0.02 + 0.9 * r(8));
+            features.data.extend((0..5).map(|c| r(c + 9) - 0.3));
+        }
+        let intrinsics = Intrinsics { fx: 50.0, fy: 45.0, cx: 20.3, cy: 18.9, width: 43, height: 37 };
+        let camera = Camera { intrinsics, pose: Pose::IDENTITY };
+        let projection = project(&g, &camera, &RasterConfig::default()).unwrap();
+        let mut d = RasterGrad::zeros(43, 37, 5);
+        for image in [&mut d.features, &mut d.opacity, &mut d.depth] {
+            image.data_mut().iter_mut().enumerate().for_each(|(i, v)| *v = ((i * 7) % 11) as f32 - 5.0);
+        }
+        let run = |arch| {
+            let (raster, pullback) = blend(Cow::Borrowed(&projection), &g, &features, arch).unwrap();
+            let pull = pullback.pull(&d).unwrap();
+            (raster, pull)
+        };
+        let (a, pull_a) = run(Arch::new());
+        let (b, pull_b) = run(Arch::Scalar);
+        let close = |a: &[f32], b: &[f32], what: &str| {
+            let (error, norm) = a.iter().zip(b).fold((0.0f64, 0.0f64), |(e, n), (x, y)| {
+                (e + (*x as f64 - *y as f64).powi(2), n + (*y as f64).powi(2))
+            });
+            assert!(error.sqrt() <= 2e-6 * norm.sqrt(), "{what}: {:.2e}", error.sqrt() / norm.sqrt());
+        };
+        close(a.features.data(), b.features.data(), "features");
+        close(a.depth.data(), b.depth.data(), "depth");
+        close(&pull_a.features, &pull_b.features, "d features");
+        close(&pull_a.gaussians.opacities, &pull_b.gaussians.opacities, "d opacities");
+        let flat = |v: &[Vec3]| v.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
+        close(&flat(&pull_a.gaussians.means), &flat(&pull_b.gaussians.means), "d means");
+        close(&flat(&pull_a.gaussians.scales), &flat(&pull_b.gaussians.scales), "d scales");
+    }
 }

@@ -12,6 +12,7 @@ pub mod metrics;
 pub mod mlp;
 pub mod pseudo_normal;
 mod real;
+pub mod splat;
 pub mod strategies;
 pub mod visibility;
 
