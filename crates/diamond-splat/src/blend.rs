@@ -41,6 +41,13 @@ pub(crate) fn block_offsets(block: usize) -> ([f32; LANES], [f32; LANES]) {
     )
 }
 
+/// Offset of a block's centre from the tile's centre.
+#[inline(always)]
+pub(crate) fn block_centre(block: usize) -> (f32, f32) {
+    let half = 0.5 * BLOCK as f32;
+    (if block % 2 == 0 { -half } else { half }, if block / 2 == 0 { -half } else { half })
+}
+
 impl Scene<'_> {
     /// x of a tile's centre, px.
     pub fn centre(tile: usize) -> f64 {

@@ -50,6 +50,14 @@ pub(crate) struct Prepared {
     pub log2_opacity: f32,
 }
 
+impl Prepared {
+    /// The same with the point of reference moved by that many pixels.
+    #[inline(always)]
+    pub fn moved(&self, (x, y): (f32, f32)) -> Prepared {
+        Prepared { u: self.u + self.u_x * x + self.u_y * y, v: self.v + self.v_y * y, ..*self }
+    }
+}
+
 /// A splat as one row of tiles needs it: small, because a row's worth of them should stay in the cache.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RowSplat {

@@ -6,9 +6,9 @@
 //!
 //! Per block the weights are recomputed front to back, then consumed back to front in groups of four splats. Sums over
 //! the 16 pixels are matrix products with a row per pixel, so no horizontal additions are needed; the geometric
-//! gradient is carried by the six moments `Σ g·(1, x, y, x², xy, y²)` about the tile's centre, which are turned into
-//! moments of the whitened offset `Lᵀd` in f64, where nothing cancels.
-use crate::blend::{Scene, block_offsets};
+//! gradient is carried by the six moments `Σ g·(1, x, y, x², xy, y²)` about the block's centre, which are turned into
+//! moments of the whitened offset `Lᵀd` in f64.
+use crate::blend::{Scene, block_centre, block_offsets};
 use crate::ellipse::{LANES, Prepared};
 use crate::lanes::{alpha, any_positive, composite, load, store, with_lanes};
 use crate::tiles::{TileLists, entry_slot};
@@ -31,20 +31,37 @@ pub(crate) struct Moments {
 }
 
 impl Moments {
-    /// Adds moments about a tile's centre.
+    /// Adds another part.
     #[inline(always)]
-    fn add_tile(&mut self, p: &Prepared, m: &[f32]) {
-        let (s, x, y) = (m[0] as f64, m[1] as f64, m[2] as f64);
-        let (xx, xy, yy) = (m[3] as f64, m[4] as f64, m[5] as f64);
-        let (u, v) = (p.u as f64, p.v as f64);
-        let (a, b, c) = (p.u_x as f64, p.u_y as f64, p.v_y as f64);
+    pub fn add(&mut self, o: &Moments) {
+        self.one += o.one;
+        for k in 0..2 {
+            self.first[k] += o.first[k];
+        }
+        for k in 0..3 {
+            self.second[k] += o.second[k];
+        }
+    }
+}
+
+/// Gives for each of four splats its moments about a block's centre, `1, x, y, x², xy, y²`, as moments of `(u, v)`, which
+/// is affine in x and y. In f64, and about the block's centre rather than the tile's, because the terms cancel where the
+/// splat is small and lies off that centre.
+#[inline(always)]
+fn whiten(to: &mut [Moments; GROUP], at: &[Prepared; GROUP], m: &[[f32; 8]; GROUP]) {
+    for k in 0..GROUP {
+        let (s, x, y) = (m[k][0] as f64, m[k][1] as f64, m[k][2] as f64);
+        let (xx, xy, yy) = (m[k][3] as f64, m[k][4] as f64, m[k][5] as f64);
+        let (u, v) = (at[k].u as f64, at[k].v as f64);
+        let (a, b, c) = (at[k].u_x as f64, at[k].u_y as f64, at[k].v_y as f64);
         let lin = a * x + b * y;
-        self.one += s;
-        self.first[0] += u * s + lin;
-        self.first[1] += v * s + c * y;
-        self.second[0] += u * (u * s + 2.0 * lin) + a * a * xx + 2.0 * a * b * xy + b * b * yy;
-        self.second[1] += u * v * s + v * lin + u * c * y + c * (a * xy + b * yy);
-        self.second[2] += v * (v * s + 2.0 * c * y) + c * c * yy;
+        to[k].one = s;
+        to[k].first = [u * s + lin, v * s + c * y];
+        to[k].second = [
+            u * (u * s + 2.0 * lin) + a * (a * xx + 2.0 * b * xy) + b * b * yy,
+            u * (v * s + c * y) + v * lin + c * (a * xy + b * yy),
+            v * (v * s + 2.0 * c * y) + c * c * yy,
+        ];
     }
 }
 
@@ -106,9 +123,8 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     let slots = lists.splats.len();
     let mut grad = RowGrad { features: vec![0.0; slots * stride], moments: vec![Moments::default(); slots] };
     let offsets: [_; 4] = std::array::from_fn(block_offsets);
-    let basis: Vec<[[f32; MOMENTS]; LANES]> = offsets.iter().map(moment_basis).collect();
+    let basis = moment_basis();
     let mut prepared: Vec<Prepared> = Vec::new();
-    let mut tile_moments: Vec<[f32; MOMENTS]> = Vec::new();
     let mut pairs: Vec<Pair> = Vec::new();
     let mut sources: Vec<u32> = Vec::new();
     // Cotangents of a block: a row per channel, and a row per pixel.
@@ -126,8 +142,6 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
         for &entry in entries {
             prepared.push(lists.splats[entry_slot(entry)].prepare(centre));
         }
-        tile_moments.clear();
-        tile_moments.resize(used, [0.0; MOMENTS]);
         for block in 0..4 {
             if reach[block] == 0 {
                 continue;
@@ -217,14 +231,25 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                     store::<S, N>(&mut g[m], g_m);
                 }
                 // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
+                let mut about_centre = [[0.0f32; MOMENTS]; GROUP];
                 let mut c = 0;
                 while c < 8 {
-                    let sums = product::<S, 1>(s, &g, &basis[block].as_flattened()[c..], MOMENTS);
-                    for m in 0..end - begin {
-                        let to = &mut tile_moments[sources[begin + m] as usize];
-                        add::<S>(s, &mut to[c..c + S::F32_LANES], sums[m][0]);
+                    let sums = product::<S, 1>(s, &g, &basis.as_flattened()[c..], MOMENTS);
+                    for m in 0..GROUP {
+                        add::<S>(s, &mut about_centre[m][c..c + S::F32_LANES], sums[m][0]);
                     }
                     c += S::F32_LANES;
+                }
+                let mut at = [Prepared::default(); GROUP];
+                let mut raw = [[0.0f32; 8]; GROUP];
+                for m in 0..GROUP {
+                    at[m] = prepared[sources[(begin + m).min(end - 1)] as usize].moved(block_centre(block));
+                    raw[m].copy_from_slice(&about_centre[m][..8]);
+                }
+                let mut moments = [Moments::default(); GROUP];
+                whiten(&mut moments, &at, &raw);
+                for m in 0..end - begin {
+                    grad.moments[slots[m]].add(&moments[m]);
                 }
                 let mut c = 0;
                 while c < stride {
@@ -252,17 +277,16 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 end = begin;
             }
         }
-        for (k, &entry) in entries.iter().enumerate() {
-            grad.moments[entry_slot(entry)].add_tile(&prepared[k], &tile_moments[k]);
-        }
     }
     grad
 }
 
-/// `(1, x, y, x², xy, y²)` of every pixel of a block.
-fn moment_basis((x, y): &([f32; LANES], [f32; LANES])) -> [[f32; MOMENTS]; LANES] {
+/// `(1, x, y, x², xy, y²)` of every pixel of a block, about the block's centre.
+fn moment_basis() -> [[f32; MOMENTS]; LANES] {
+    let (xs, ys) = block_offsets(0);
+    let centre = block_centre(0);
     std::array::from_fn(|lane| {
-        let (x, y) = (x[lane], y[lane]);
+        let (x, y) = (xs[lane] - centre.0, ys[lane] - centre.1);
         let mut basis = [0.0; MOMENTS];
         basis[..6].copy_from_slice(&[1.0, x, y, x * x, x * y, y * y]);
         basis

@@ -306,12 +306,6 @@ impl RasterPullback<'_> {
 }
 
 impl Moments {
-    fn add(&mut self, o: &Moments) {
-        self.one += o.one;
-        (0..2).for_each(|k| self.first[k] += o.first[k]);
-        (0..3).for_each(|k| self.second[k] += o.second[k]);
-    }
-
     /// Whitened moments to the cotangent of mean and covariance `[eq:splat-footprint-pull]`:
     /// `d/d mean = L Σ g w`, `d/d Σ = ½ L (Σ g w wᵀ) Lᵀ` with `w = Lᵀd`.
     fn footprint_grad(&self, [l11, l21, l22]: [f64; 3], d_depth: f64) -> FootprintGrad {
