@@ -55,6 +55,14 @@ pub enum StoredTransfer {
     Linear,
 }
 
+impl Residual {
+    /// Transfer values per Gaussian: three colours times (degree + 1)² harmonics, or none.
+    pub fn transfer_width(&self) -> usize {
+        let side = self.transfer_degree as usize + 1;
+        if self.transfer { 3 * side * side } else { 0 }
+    }
+}
+
 impl StoredTransfer {
     /// The transfer function it names.
     pub fn transfer(self) -> diamond_image::Transfer {
@@ -278,8 +286,10 @@ pub struct Residual {
     pub scale_by_light: bool,
     /// Learned latent values per Gaussian that the network reads.
     pub codes: usize,
-    /// Degree of the per-Gaussian SH transfer vectors; absent for none.
-    pub transfer_degree: Option<u32>,
+    /// Whether every Gaussian has transfer vectors: SH coefficients of a residual that is linear in the light.
+    pub transfer: bool,
+    /// Degree of the transfer vectors, at most 3.
+    pub transfer_degree: u32,
     /// L2 shrinkage of the transfer vectors of degree l, × l².
     pub transfer_smoothness: f32,
 }
@@ -472,8 +482,9 @@ impl Config {
                 self.initial.opacity
             ));
         }
-        if let Some(degree) = self.residual.transfer_degree.filter(|d| *d > 3) {
-            return fail(format!("`residual.transfer_degree` must be at most 3, found {degree}"));
+        if self.residual.transfer_degree > 3 {
+            let found = self.residual.transfer_degree;
+            return fail(format!("`residual.transfer_degree` must be at most 3, found {found}"));
         }
         let losses = [
             ("l2", self.loss.l2),

@@ -333,7 +333,7 @@ impl Engine for CpuEngine {
     fn restore(&mut self, path: &Path, mut state: TensorFile) -> Result<(), ReconstructError> {
         let n: usize = state.metadata_value(path, "gaussians")?;
         let config = &self.model.config;
-        let transfer = crate::model::transfer_width(config.residual.transfer_degree);
+        let transfer = config.residual.transfer_width();
         let mut parameters = crate::GaussianParameters::zeros(n, transfer, config.residual.codes);
         for attribute in Attribute::ALL {
             let group = parameters.group_mut(attribute);

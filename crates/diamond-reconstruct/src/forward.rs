@@ -1,7 +1,6 @@
 //! From raw parameters to a picture under one light, and the way back: the stages between the parameters and the
 //! objective, in the order in which they run.
 use crate::cpu::Profile;
-use crate::model::transfer_width;
 use crate::{
     Activated, ActivatedGrad, Attribute, CombineVariant, DiffuseVariant, FresnelVariant, IncidentVariant,
     MaskingVariant, Model, ReconstructError, Rendering, StepPlan, error, visibility_cache,
@@ -71,7 +70,7 @@ impl Settings {
             visibility: if s.surface_visibility { SurfaceVisibility::Multiplied } else { SurfaceVisibility::Ignored },
             horizon_leak: s.horizon_leak,
             roughness,
-            use_residual: c.residual.network || c.residual.transfer_degree.is_some(),
+            use_residual: c.residual.network || c.residual.transfer,
             incident_offset,
             scale_residual_by_light: c.residual.scale_by_light,
         };
@@ -152,11 +151,7 @@ impl Rows {
             scales: pick(&g.scales),
             normals: pick(&activated.normals),
             codes: gather(model.parameters.values(Attribute::Codes), residual.codes, visible),
-            transfer: gather(
-                model.parameters.values(Attribute::Transfer),
-                transfer_width(residual.transfer_degree),
-                visible,
-            ),
+            transfer: gather(model.parameters.values(Attribute::Transfer), residual.transfer_width(), visible),
             positions,
             visible: visible.to_vec(),
         }
@@ -228,8 +223,9 @@ fn input_scaling(model: &Model) -> InputScaling {
 }
 
 fn transfer_config(model: &Model) -> Option<TransferConfig> {
-    let degree = model.config.residual.transfer_degree? as usize;
-    Some(TransferConfig { degree, activation: TransferActivation::Linear })
+    let residual = &model.config.residual;
+    let degree = residual.transfer_degree as usize;
+    residual.transfer.then_some(TransferConfig { degree, activation: TransferActivation::Linear })
 }
 
 /// Runs one pair forward, asks `objective` for the gradient, and runs the pair backward.
@@ -343,7 +339,7 @@ pub fn value_and_grad(
     }
     if let Some((_, pullback)) = &transfer {
         let grad = pullback.pull(&d_residual, false).map_err(error::stage("transfer vectors.pull"))?;
-        let width = transfer_width(model.config.residual.transfer_degree);
+        let width = model.config.residual.transfer_width();
         out.transfer = vec![0.0; n * width];
         for (row, &i) in rows.visible.iter().enumerate() {
             out.transfer[i as usize * width..(i as usize + 1) * width]

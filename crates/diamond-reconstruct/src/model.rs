@@ -34,11 +34,6 @@ const MIN_INITIAL_SCALE: f32 = 1e-4;
 /// Largest initial standard deviation, × scene radius: lone points would otherwise cover the image.
 const MAX_INITIAL_SCALE: f32 = 0.1;
 
-/// Values of a transfer vector set of SH degree `degree`, three colours.
-pub(crate) fn transfer_width(degree: Option<u32>) -> usize {
-    degree.map_or(0, |d| 3 * (d as usize + 1) * (d as usize + 1))
-}
-
 /// The network's shape under a configuration.
 pub(crate) fn network_config(config: &Config) -> ResidualNetworkConfig {
     let mut out = ResidualNetworkConfig::sss_3dgs();
@@ -57,8 +52,7 @@ impl Model {
     /// The model before the first step.
     pub fn initial(config: &Config, scene: Scene, points: &InitialPoints) -> Result<Self, ReconstructError> {
         let n = points.positions.len();
-        let mut parameters =
-            GaussianParameters::zeros(n, transfer_width(config.residual.transfer_degree), config.residual.codes);
+        let mut parameters = GaussianParameters::zeros(n, config.residual.transfer_width(), config.residual.codes);
         let mut random = Random::new(config.seed, Purpose::Initial, 1);
         let distances = mean_squared_distance_to_nearest(&points.positions, 3);
         for i in 0..n {
@@ -231,8 +225,7 @@ const SEQUENCES: [(&str, Attribute); 3] =
 
 fn from_ply(table: &PlyTable, config: &Config, path: &Path) -> Result<GaussianParameters, ReconstructError> {
     let n = table.len;
-    let mut parameters =
-        GaussianParameters::zeros(n, transfer_width(config.residual.transfer_degree), config.residual.codes);
+    let mut parameters = GaussianParameters::zeros(n, config.residual.transfer_width(), config.residual.codes);
     let mut fill = |name: &str, attribute: Attribute, column: usize| -> Result<(), ReconstructError> {
         let values = table.column(name).ok_or_else(|| ReconstructError::Checkpoint {
             path: path.to_owned(),
@@ -259,7 +252,7 @@ fn from_ply(table: &PlyTable, config: &Config, path: &Path) -> Result<GaussianPa
     for (prefix, attribute) in SEQUENCES {
         let width = match attribute {
             Attribute::VisibilitySh => diamond_light::spherical_harmonics::COEFFICIENTS,
-            Attribute::Transfer => transfer_width(config.residual.transfer_degree),
+            Attribute::Transfer => config.residual.transfer_width(),
             _ => config.residual.codes,
         };
         for k in 0..width {

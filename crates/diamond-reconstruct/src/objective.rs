@@ -200,7 +200,10 @@ pub fn visibility_term(
 /// Shrinkage of the transfer vectors' bands: Σ l²·t² / N, so that light it has not seen is interpolated smoothly.
 pub fn regularise(model: &Model, total: &mut ActivatedGrad, terms: &mut Terms) {
     let weight = model.config.residual.transfer_smoothness;
-    let Some(degree) = model.config.residual.transfer_degree.filter(|_| weight > 0.0) else { return };
+    if weight <= 0.0 || !model.config.residual.transfer {
+        return;
+    }
+    let degree = model.config.residual.transfer_degree;
     let values = model.parameters.values(Attribute::Transfer);
     total.transfer.resize(values.len(), 0.0);
     let coefficients = (degree as usize + 1) * (degree as usize + 1);

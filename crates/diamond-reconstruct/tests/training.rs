@@ -68,7 +68,7 @@ fn training_lowers_the_objective_with_every_preset() {
 #[test]
 fn two_runs_and_any_number_of_threads_give_the_same_bits() {
     let mut config = short("resolved", 40);
-    config.residual.transfer_degree = Some(2);
+    assert!(config.residual.transfer && config.residual.network, "every part of the model takes part");
     let one = train(&config, 1);
     assert!(one == train(&config, 1), "two runs differ");
     assert!(one == train(&config, 2), "one and two threads differ");
