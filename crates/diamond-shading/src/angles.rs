@@ -108,7 +108,8 @@ mod tests {
             n in unit_vector(), v in unit_vector(), l in unit_vector(),
             d in [-1.0f32..1.0, -1.0f32..1.0, -1.0f32..1.0, -1.0f32..1.0],
         ) {
-            prop_assume!((Vec3::from(v) + Vec3::from(l)).length() > 0.02);
+            // Nearly opposite directions magnify their rounding, which the oracle normalises away.
+            prop_assume!((Vec3::from(v) + Vec3::from(l)).length() > 0.2);
             let x: Vec<f64> = [widen(n), widen(v), widen(l)].concat();
             let naive = |x: &[Dual]| {
                 let a = ggx::angles([x[0], x[1], x[2]], [x[3], x[4], x[5]], [x[6], x[7], x[8]]);
