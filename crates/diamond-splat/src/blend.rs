@@ -45,7 +45,7 @@ pub(crate) fn block_offsets(block: usize) -> ([f32; LANES], [f32; LANES]) {
 #[inline(always)]
 pub(crate) fn block_centre(block: usize) -> (f32, f32) {
     let half = 0.5 * BLOCK as f32;
-    (if block % 2 == 0 { -half } else { half }, if block / 2 == 0 { -half } else { half })
+    (if block.is_multiple_of(2) { -half } else { half }, if block / 2 == 0 { -half } else { half })
 }
 
 impl Scene<'_> {

@@ -47,9 +47,7 @@ pub(crate) fn load<S: Simd, const N: usize>(from: &[f32; LANES]) -> Block<S, N> 
 #[inline(always)]
 pub(crate) fn store<S: Simd, const N: usize>(to: &mut [f32; LANES], values: Block<S, N>) {
     let (v, _) = S::as_mut_simd_f32s(to);
-    for i in 0..N {
-        v[i] = values[i];
-    }
+    v[..N].copy_from_slice(&values);
 }
 
 /// The thresholds of the compositing rule.
