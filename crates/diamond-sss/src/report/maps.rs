@@ -9,8 +9,11 @@ pub fn data_uri(png: &[u8]) -> String {
     format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(png))
 }
 
+/// Name, remark and encoded PNG of one map.
+pub type MapPicture = (&'static str, String, Vec<u8>);
+
 /// Name, remark and PNG of each map of a rendering.
-pub fn map_pictures(r: &Rendering) -> Result<Vec<(&'static str, String, Vec<u8>)>, SssError> {
+pub fn map_pictures(r: &Rendering) -> Result<Vec<MapPicture>, SssError> {
     let (width, height) = (r.radiance.width(), r.radiance.height());
     let opacity = r.opacity.data();
     let over_black = |v: f32, i: usize| v * opacity[i];
