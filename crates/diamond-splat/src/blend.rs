@@ -149,6 +149,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
             t[block] = scene.initial_transmittance(tile, row, block);
         }
         let mut sum = [[0.0f32; LANES]; 4];
+        let mut blended = [0u32; LANES];
         acc.fill([0.0; LANES]);
         // Which blocks still let light through, as entry bits.
         let mut open: u32 = (0..4).map(|b| ((t[b] != [0.0; LANES]) as u32) << b).sum();
@@ -214,9 +215,14 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
                     }
                 }
                 for w in &weights[..n] {
-                    work.blended += w.iter().map(|&w| (w > 0.0) as u32).sum::<u32>() as u64;
+                    for lane in 0..LANES {
+                        blended[lane] += (w[lane] > 0.0) as u32;
+                    }
                 }
             }
+        }
+        for count in blended {
+            work.blended += count as u64;
         }
         for block in 0..4 {
             for lane in 0..LANES {

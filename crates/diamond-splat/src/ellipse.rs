@@ -91,14 +91,14 @@ impl Ellipse {
         let kappa = KAPPA2.sqrt();
         let chol = s.chol.map(|v| v * kappa);
         let [l11, l21, l22] = s.chol;
-        let [ex, ey] = s.extent();
+        let ex = (s.two_tau * s.cov[0]).sqrt();
         Self {
             mean: s.mean,
             chol,
             chol_f32: chol.map(|v| v as f32),
             log2_opacity: (s.opacity as f64).log2() as f32,
             two_tau: s.two_tau as f32,
-            extent: [ex as f32, ey as f32],
+            extent: s.extent,
             y_of_rightmost: (s.cov[1] / s.cov[0] * ex) as f32,
             slope: (-l21 / l11) as f32,
             half_width: (1.0 / l11) as f32,
@@ -159,6 +159,7 @@ mod tests {
                 cov: [a, b, c],
                 chol: [(c / det).sqrt(), -b / (c * det).sqrt(), 1.0 / c.sqrt()],
                 two_tau: 11.0 * r(6),
+                extent: [(11.0 * r(6) * a).sqrt() as f32, (11.0 * r(6) * c).sqrt() as f32],
                 opacity: 0.5,
                 ..Default::default()
             };

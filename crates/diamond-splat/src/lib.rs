@@ -7,6 +7,7 @@ mod config;
 pub mod density;
 mod ellipse;
 mod error;
+mod footprint;
 mod gaussians;
 mod hull;
 mod lanes;

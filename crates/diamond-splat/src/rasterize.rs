@@ -1,8 +1,9 @@
 //! The rasteriser's front: `rasterize`, what it returns, and the pullback that belongs to it.
 use crate::blend::{GROUP, RowForward, RowWork, Scene};
 use crate::ellipse::{KAPPA2, TILE};
+use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::{Thresholds, vector_width};
-use crate::projection::{FootprintGrad, View, finite_f32, is_smooth, project, project_pull};
+use crate::projection::{is_smooth, project};
 use crate::pullback::{Moments, RowBackward, RowGrad};
 use crate::tiles::{Rows, TileLists, assign_rows};
 use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
@@ -12,6 +13,9 @@ use glam::Vec2;
 use pulp::Arch;
 use rayon::prelude::*;
 use std::borrow::Cow;
+
+/// Gaussians whose gradient is one parallel task.
+const PIECE: usize = 512;
 
 /// What a view of the Gaussians looks like. Weights are `w_k = α_k Π_{j<k} (1 − α_j)`, nearest first.
 #[derive(Debug, Clone, PartialEq)]
@@ -256,45 +260,50 @@ impl RasterPullback<'_> {
             .with_min_len(512)
             .enumerate()
             .for_each(|(rank, (features, moments))| self.sum_rows(rank, parts, features, moments));
-        let mut rank_of = vec![u32::MAX; n];
+        // Then by Gaussian, in pieces of the ascending list of splats.
+        let mut rank_of = vec![0u32; splats.len()];
         for (rank, &i) in self.rows.order.iter().enumerate() {
-            rank_of[splats[i as usize].gaussian as usize] = rank as u32;
+            rank_of[i as usize] = rank as u32;
         }
-        // Then by Gaussian.
         let view = View::new(&self.projection.camera);
-        let mut d_features = vec![0.0; n * channels];
-        if channels > 0 {
-            d_features.par_chunks_mut(channels).zip(&rank_of).with_min_len(1024).for_each(|(to, &rank)| {
-                if rank != u32::MAX {
-                    to.copy_from_slice(&features[rank as usize * stride..][..channels]);
-                }
-            });
-        }
         let mut g = GaussiansGrad::zeros(n);
         let mut screen = vec![Vec2::ZERO; n];
-        (&mut g.means, &mut g.scales, &mut g.rotations, &mut g.opacities, &mut screen, &rank_of)
+        let mut d_features = vec![0.0; n * channels];
+        let mut feature_pieces: Vec<&mut [f32]> = d_features.chunks_mut((PIECE * channels).max(1)).collect();
+        feature_pieces.resize_with(n.div_ceil(PIECE), Default::default);
+        (
+            g.means.par_chunks_mut(PIECE),
+            g.scales.par_chunks_mut(PIECE),
+            g.rotations.par_chunks_mut(PIECE),
+            g.opacities.par_chunks_mut(PIECE),
+            screen.par_chunks_mut(PIECE),
+            feature_pieces,
+        )
             .into_par_iter()
             .enumerate()
-            .with_min_len(256)
-            .for_each(|(i, (mean, scale, rotation, opacity, screen, &rank))| {
-                if rank == u32::MAX {
-                    return;
+            .for_each(|(piece, (means, scales, rotations, opacities, screen, d_features))| {
+                let first = piece * PIECE;
+                let begin = splats.partition_point(|s| (s.gaussian as usize) < first);
+                for (splat, &rank) in splats[begin..].iter().zip(&rank_of[begin..]) {
+                    let (gaussian, rank) = (splat.gaussian as usize, rank as usize);
+                    let i = gaussian - first;
+                    if i >= PIECE {
+                        break;
+                    }
+                    let line = &features[rank * stride..][..stride];
+                    let footprint = moments[rank].footprint_grad(splat.chol, line[channels] as f64);
+                    let d = project_pull(self.gaussians, gaussian, &view, &footprint);
+                    (means[i], scales[i], rotations[i]) = (d.mean, d.scale, d.rotation);
+                    opacities[i] = finite_f32(moments[rank].one / splat.opacity as f64);
+                    screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
+                    d_features[i * channels..(i + 1) * channels].copy_from_slice(&line[..channels]);
                 }
-                let splat = &splats[self.rows.order[rank as usize] as usize];
-                let sum = &moments[rank as usize];
-                let d_depth = features[rank as usize * stride + channels] as f64;
-                let footprint = sum.footprint_grad(splat.chol, d_depth);
-                let d = project_pull(self.gaussians, i, &view, &footprint);
-                (*mean, *scale, *rotation) = (d.mean, d.scale, d.rotation);
-                *opacity = finite_f32(sum.one / splat.opacity as f64);
-                *screen = Vec2::from_array(footprint.mean.map(finite_f32));
             });
         RasterPull { gaussians: g, features: d_features, screen }
     }
 
     fn sum_rows(&self, rank: usize, parts: &[RowGrad], features: &mut [f32], moments: &mut Moments) {
-        let splat = &self.projection.splats[self.rows.order[rank] as usize];
-        let first_row = splat.pixel_rows(self.projection.camera.intrinsics.height).0 as usize / TILE;
+        let first_row = self.rows.spans[rank].0 as usize;
         let slots = &self.rows.rank_slots[self.rows.rank_start[rank]..self.rows.rank_start[rank + 1]];
         for (row, &slot) in (first_row..).zip(slots) {
             let slot = slot as usize - self.rows.row_start[row];

@@ -24,6 +24,8 @@ pub(crate) struct Rows {
     pub row_start: Vec<usize>,
     /// Slot → rank.
     pub slot_rank: Vec<u32>,
+    /// By rank: the rows (first, one past last).
+    pub spans: Vec<(u32, u32)>,
     /// The slots of a rank are `rank_slots[rank_start[rank]..rank_start[rank + 1]]`, in order of rows.
     pub rank_start: Vec<usize>,
     /// See `rank_start`.
@@ -47,8 +49,7 @@ pub(crate) fn assign_rows(projection: &Projection) -> Rows {
         .with_min_len(1024)
         .map(|&i| {
             let s = &splats[i as usize];
-            let (y0, y1) = s.pixel_rows(height);
-            (Ellipse::new(s), (y0 / TILE as u32, y1.div_ceil(TILE as u32)))
+            (Ellipse::new(s), (s.rows[0] / TILE as u32, s.rows[1].div_ceil(TILE as u32)))
         })
         .unzip();
     let sources = order.iter().map(|&i| (splats[i as usize].gaussian, splats[i as usize].depth)).collect();
@@ -73,7 +74,7 @@ pub(crate) fn assign_rows(projection: &Projection) -> Rows {
             next[r] += 1;
         }
     }
-    Rows { order, ellipses, sources, row_start, slot_rank, rank_start, rank_slots }
+    Rows { order, ellipses, sources, row_start, slot_rank, spans, rank_start, rank_slots }
 }
 
 /// The lists of the tiles of one row.

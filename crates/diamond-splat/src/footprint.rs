@@ -1,0 +1,268 @@
+//! The map from one Gaussian to its footprint on screen, in f64, and its pullback.
+use crate::Gaussians;
+use diamond_camera::Camera;
+use glam::{Quat, Vec3, Vec4};
+
+/// How far beyond the image, as a fraction of the half field of view, the linearisation point may lie. Farther out the
+/// tangent x/z is clamped, because the linear map there would smear a Gaussian over the whole image.
+const JACOBIAN_MARGIN: f64 = 0.3;
+/// Quaternions of smaller squared norm count as the identity, with zero gradient: their direction is rounding noise.
+const MIN_QUATERNION_NORM2: f64 = 1e-24;
+/// A camera in f64, with the limits of the linearisation point.
+pub(crate) struct View {
+    w: [[f64; 3]; 3],
+    t: [f64; 3],
+    /// Focal lengths and principal point, px.
+    pub f: [f64; 2],
+    pub c: [f64; 2],
+    /// Lower and upper limit of x/z and y/z.
+    limits: [[f64; 2]; 2],
+    pub size: [u32; 2],
+}
+
+impl View {
+    pub fn new(camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        let r = camera.pose.rotation.to_cols_array_2d();
+        let (f, c) = ([k.fx as f64, k.fy as f64], [k.cx as f64, k.cy as f64]);
+        let limits = std::array::from_fn(|a| {
+            let side = [k.width, k.height][a] as f64;
+            let margin = JACOBIAN_MARGIN * 0.5 * side / f[a];
+            [-c[a] / f[a] - margin, (side - c[a]) / f[a] + margin]
+        });
+        Self {
+            w: std::array::from_fn(|row| std::array::from_fn(|col| r[col][row] as f64)),
+            t: camera.pose.translation.to_array().map(f64::from),
+            f,
+            c,
+            limits,
+            size: [k.width, k.height],
+        }
+    }
+}
+
+impl View {
+    /// World point to camera coordinates.
+    #[inline]
+    pub fn to_camera(&self, world: Vec3) -> [f64; 3] {
+        let [x, y, z] = world.to_array().map(f64::from);
+        let row = |r: usize| self.w[r][0] * x + self.w[r][1] * y + self.w[r][2] * z + self.t[r];
+        [row(0), row(1), row(2)]
+    }
+
+    /// World axes of a vector in camera axes.
+    #[inline]
+    fn to_world_axes(&self, d: [f64; 3]) -> [f64; 3] {
+        let column = |c: usize| self.w[0][c] * d[0] + self.w[1][c] * d[1] + self.w[2][c] * d[2];
+        [column(0), column(1), column(2)]
+    }
+}
+
+/// The intermediate values of one projection that its pullback needs as well.
+pub(crate) struct Linearised {
+    /// Mean in camera coordinates.
+    pub p: [f64; 3],
+    /// Clamped x/z, y/z of the linearisation point, and whether the clamp was inactive.
+    tangent: [f64; 2],
+    free: [bool; 2],
+    /// Unit quaternion x, y, z, w and 1/norm (0 where it counts as the identity).
+    q: [f64; 4],
+    inv_norm: f64,
+    /// Rotation of the Gaussian in camera axes.
+    v: [[f64; 3]; 3],
+    /// A = J · W · R_q · diag(s), 2 × 3.
+    pub a: [[f64; 3]; 2],
+}
+
+impl Linearised {
+    pub fn new(mean: Vec3, scale: Vec3, rotation: Quat, view: &View) -> Self {
+        let p = view.to_camera(mean);
+        let inv_z = 1.0 / p[2];
+        let raw = [p[0] * inv_z, p[1] * inv_z];
+        let [x, y] = view.limits;
+        let tangent = [raw[0].max(x[0]).min(x[1]), raw[1].max(y[0]).min(y[1])];
+        let free = [tangent[0] == raw[0], tangent[1] == raw[1]];
+        let [qx, qy, qz, qw] = rotation.to_array().map(f64::from);
+        let norm2 = qx * qx + qy * qy + qz * qz + qw * qw;
+        let (q, inv_norm) = if norm2 < MIN_QUATERNION_NORM2 {
+            ([0.0, 0.0, 0.0, 1.0], 0.0)
+        } else {
+            let inv = 1.0 / norm2.sqrt();
+            ([qx * inv, qy * inv, qz * inv, qw * inv], inv)
+        };
+        let rotation = rotation_matrix(q);
+        let mut v = [[0.0; 3]; 3];
+        for r in 0..3 {
+            for c in 0..3 {
+                v[r][c] = view.w[r][0] * rotation[0][c] + view.w[r][1] * rotation[1][c] + view.w[r][2] * rotation[2][c];
+            }
+        }
+        let s = scale.to_array();
+        let mut a = [[0.0; 3]; 2];
+        for axis in 0..2 {
+            let k = view.f[axis] * inv_z;
+            for j in 0..3 {
+                a[axis][j] = k * (v[axis][j] - tangent[axis] * v[2][j]) * s[j] as f64;
+            }
+        }
+        Self { p, tangent, free, q, inv_norm, v, a }
+    }
+}
+
+fn rotation_matrix([x, y, z, w]: [f64; 4]) -> [[f64; 3]; 3] {
+    [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+}
+
+/// Pullback of [`rotation_matrix`] for the four numbers as if they were independent.
+fn rotation_matrix_pull([x, y, z, w]: [f64; 4], d: [[f64; 3]; 3]) -> [f64; 4] {
+    let (s01, s02, s12) = (d[0][1] + d[1][0], d[0][2] + d[2][0], d[1][2] + d[2][1]);
+    let (a21, a02, a10) = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]);
+    [
+        2.0 * (y * s01 + z * s02 - 2.0 * x * (d[1][1] + d[2][2]) + w * a21),
+        2.0 * (x * s01 + z * s12 - 2.0 * y * (d[0][0] + d[2][2]) + w * a02),
+        2.0 * (x * s02 + y * s12 - 2.0 * z * (d[0][0] + d[1][1]) + w * a10),
+        2.0 * (x * a21 + y * a02 + z * a10),
+    ]
+}
+
+/// Cotangent of one footprint.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct FootprintGrad {
+    /// d loss / d mean, per px.
+    pub mean: [f64; 2],
+    /// d loss / d covariance as the symmetric matrix xx, xy, yy (the xy entry counts twice in an inner product).
+    pub cov: [f64; 3],
+    /// d loss / d view-space z through depth alone.
+    pub depth: f64,
+}
+
+/// Gradient of the four parameters of one Gaussian, in f64.
+pub(crate) struct GaussianGrad {
+    pub mean: Vec3,
+    pub scale: Vec3,
+    pub rotation: Vec4,
+}
+
+/// Pullback of the projection of Gaussian `i` (all but the opacity, which does not move a footprint).
+pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGrad) -> GaussianGrad {
+    let lin = Linearised::new(g.means[i], g.scales[i], g.rotations[i], view);
+    let s = g.scales[i].to_array().map(f64::from);
+    let inv_z = 1.0 / lin.p[2];
+    let k = [view.f[0] * inv_z, view.f[1] * inv_z];
+    let mut d_p = [0.0, 0.0, d.depth];
+    let mut d_v = [[0.0; 3]; 3];
+    let mut d_s = [0.0; 3];
+    for axis in 0..2 {
+        // d loss / d A = 2 · dΣ · A.
+        let (same, cross) = (d.cov[2 * axis], d.cov[1]);
+        let (mut d_tangent, mut d_k) = (0.0, 0.0);
+        for j in 0..3 {
+            let d_a = 2.0 * (same * lin.a[axis][j] + cross * lin.a[1 - axis][j]);
+            let ray = lin.v[axis][j] - lin.tangent[axis] * lin.v[2][j];
+            d_v[axis][j] += d_a * k[axis] * s[j];
+            d_v[2][j] -= d_a * k[axis] * lin.tangent[axis] * s[j];
+            d_s[j] += d_a * k[axis] * ray;
+            d_tangent -= d_a * k[axis] * lin.v[2][j] * s[j];
+            d_k += d_a * ray * s[j];
+        }
+        d_p[2] -= d_k * k[axis] * inv_z;
+        let mut d_ratio = d.mean[axis] * view.f[axis];
+        if lin.free[axis] {
+            d_ratio += d_tangent;
+        }
+        d_p[axis] += d_ratio * inv_z;
+        d_p[2] -= d_ratio * lin.p[axis] * inv_z * inv_z;
+    }
+    let d_mean = view.to_world_axes(d_p);
+    let mut d_rotation = [[0.0; 3]; 3];
+    for j in 0..3 {
+        let column = view.to_world_axes([d_v[0][j], d_v[1][j], d_v[2][j]]);
+        for r in 0..3 {
+            d_rotation[r][j] = column[r];
+        }
+    }
+    let d_unit = rotation_matrix_pull(lin.q, d_rotation);
+    let along: f64 = (0..4).map(|c| d_unit[c] * lin.q[c]).sum();
+    let d_q: [f64; 4] = std::array::from_fn(|c| (d_unit[c] - along * lin.q[c]) * lin.inv_norm);
+    GaussianGrad {
+        mean: Vec3::from_array(d_mean.map(finite_f32)),
+        scale: Vec3::from_array(d_s.map(finite_f32)),
+        rotation: Vec4::from_array(d_q.map(finite_f32)),
+    }
+}
+
+/// To f32 without overflow to infinity: a finite cotangent must give a finite gradient.
+pub(crate) fn finite_f32(v: f64) -> f32 {
+    (v as f32).clamp(f32::MIN, f32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_camera::{Intrinsics, Pose};
+    use diamond_testkit::splat::{SplatCamera, SplatRules, project_splat};
+    use diamond_testkit::{Dual, Real, adjoint::relative_l2, vjp};
+    use proptest::prelude::*;
+
+    fn unit() -> impl Strategy<Value = f32> {
+        -1.0f32..1.0
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
+
+        /// [eq:ewa-projection]: mean, covariance and z of one Gaussian; the pullback against dual numbers, inside and
+        /// outside the limits of the linearisation point.
+        #[test]
+        fn the_pullback_agrees_with_dual_numbers(
+            mean in [unit(), unit(), unit()],
+            scale in [0.001f32..0.5, 0.001f32..0.5, 0.001f32..0.5],
+            q in [unit(), unit(), unit(), unit()],
+            d in [unit(), unit(), unit(), unit(), unit(), unit()],
+        ) {
+            prop_assume!(q.iter().map(|v| v * v).sum::<f32>() > 0.01);
+            let intrinsics = Intrinsics { fx: 31.0, fy: 27.0, cx: 11.0, cy: 20.0, width: 33, height: 29 };
+            let pose = Pose::look_at(Vec3::new(0.4, -0.3, -2.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y);
+            let camera = Camera { intrinsics, pose };
+            let r = pose.rotation.to_cols_array_2d();
+            let oracle = SplatCamera {
+                rotation: std::array::from_fn(|row| std::array::from_fn(|col| r[col][row] as f64)),
+                translation: pose.translation.to_array().map(f64::from),
+                focal: [31.0, 27.0],
+                centre: [11.0, 20.0],
+                size: [33, 29],
+            };
+            let rules = SplatRules {
+                low_pass: 0.3, max_alpha: 0.99, min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, near: 0.2, smooth: false,
+            };
+            let f = |x: &[Dual]| {
+                let mut g = x.to_vec();
+                g.push(Dual::of(0.5));
+                let (m, c, z) = project_splat(&g, &oracle, &rules).expect("in front of the camera");
+                let det = c[0] * c[2] - c[1] * c[1];
+                vec![m[0], m[1], c[2] / det, -c[1] / det, c[0] / det, z]
+            };
+            let x: Vec<f64> = mean.iter().chain(&scale).chain(&q).map(|&v| v as f64).collect();
+            let d = d.map(f64::from);
+            // The symmetric matrix counts its off-diagonal entry twice.
+            let expected = vjp(f, &x, &[d[0], d[1], d[2], 2.0 * d[3], d[4], d[5]]);
+            let mut g = Gaussians::default();
+            g.push(Vec3::from_array(mean), Vec3::from_array(scale), Quat::from_array(q), 0.5);
+            let footprint = FootprintGrad { mean: [d[0], d[1]], cov: [d[2], d[3], d[4]], depth: d[5] };
+            let found = project_pull(&g, 0, &View::new(&camera), &footprint);
+            let found: Vec<f64> = (found.mean.to_array().into_iter())
+                .chain(found.scale.to_array())
+                .chain(found.rotation.to_array())
+                .map(f64::from)
+                .collect();
+            for (range, what) in [(0..3, "mean"), (3..6, "scale"), (6..10, "rotation")] {
+                let error = relative_l2(&found[range.clone()], &expected[range], 1e-6);
+                prop_assert!(error < 1e-5, "{}: {:.2e}", what, error);
+            }
+        }
+    }
+}
