@@ -148,17 +148,52 @@ macro_rules! with_lanes {
 }
 pub(crate) use with_lanes;
 
-/// Width of a vector of that instruction set.
-pub(crate) fn vector_width(arch: pulp::Arch) -> usize {
-    struct Width;
-    impl pulp::WithSimd for Width {
-        type Output = usize;
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, _: S) -> usize {
-            S::F32_LANES
+/// Which instructions the kernels are run with.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Level {
+    /// The best that the processor has.
+    Native(pulp::Arch),
+    /// One lane.
+    #[cfg(test)]
+    Scalar,
+    /// Four lanes without vector instructions, to test the structure.
+    #[cfg(test)]
+    Four,
+    /// Sixteen lanes without vector instructions, to test the structure where there is no AVX-512.
+    #[cfg(test)]
+    Sixteen,
+}
+
+impl Level {
+    /// The best that the processor has.
+    pub fn native() -> Self {
+        Level::Native(pulp::Arch::new())
+    }
+
+    pub fn dispatch<Op: pulp::WithSimd>(self, op: Op) -> Op::Output {
+        match self {
+            Level::Native(arch) => arch.dispatch(op),
+            #[cfg(test)]
+            Level::Scalar => op.with_simd(pulp::Scalar::new()),
+            #[cfg(test)]
+            Level::Four => op.with_simd(pulp::Scalar128b),
+            #[cfg(test)]
+            Level::Sixteen => op.with_simd(pulp::Scalar512b),
         }
     }
-    arch.dispatch(Width)
+
+    /// Lanes of a vector.
+    pub fn width(self) -> usize {
+        struct Width;
+        impl pulp::WithSimd for Width {
+            type Output = usize;
+            #[inline(always)]
+            fn with_simd<S: Simd>(self, _: S) -> usize {
+                S::F32_LANES
+            }
+        }
+        self.dispatch(Width)
+    }
 }
 
 #[cfg(test)]
@@ -180,8 +215,7 @@ mod tests {
                 })
             }
         }
-        use pulp::WithSimd;
-        let worst = pulp::Arch::new().dispatch(Sweep).max(Sweep.with_simd(pulp::Scalar::new()));
+        let worst = Level::native().dispatch(Sweep).max(Level::Scalar.dispatch(Sweep));
         assert!(worst < 2.5e-7, "relative error {worst:.2e}");
     }
 }

@@ -2,7 +2,7 @@
 use crate::blend::{GROUP, RowForward, RowWork, Scene};
 use crate::ellipse::{KAPPA2, TILE};
 use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
-use crate::lanes::{Thresholds, vector_width};
+use crate::lanes::{Level, Thresholds};
 use crate::projection::{is_smooth, project};
 use crate::pullback::{Moments, RowBackward, RowGrad};
 use crate::tiles::{Rows, TileLists, assign_rows};
@@ -10,7 +10,6 @@ use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, Raster
 use diamond_camera::Camera;
 use diamond_image::Image;
 use glam::Vec2;
-use pulp::Arch;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -74,7 +73,7 @@ pub struct RasterPullback<'a> {
     rows: Rows,
     lists: Vec<TileLists>,
     /// The instruction set of the forward pass: the reverse must see the same bits.
-    arch: Arch,
+    level: Level,
 }
 
 /// Projects and blends `[eq:splat-blend]`.
@@ -112,7 +111,7 @@ pub fn rasterize<'a>(
     config: &RasterConfig,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let projection = project(gaussians, camera, config)?;
-    blend(Cow::Owned(projection), gaussians, features, Arch::new())
+    blend(Cow::Owned(projection), gaussians, features, Level::native())
 }
 
 /// [`rasterize`] with a projection that was made before, for callers that compute features of
@@ -126,14 +125,14 @@ pub fn rasterize_projected<'a>(
     gaussians: &'a Gaussians,
     features: &'a Features,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
-    blend(Cow::Borrowed(projection), gaussians, features, Arch::new())
+    blend(Cow::Borrowed(projection), gaussians, features, Level::native())
 }
 
 fn blend<'a>(
     projection: Cow<'a, Projection>,
     gaussians: &'a Gaussians,
     features: &'a Features,
-    arch: Arch,
+    level: Level,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let n = gaussians.len();
     if projection.radii().len() != n {
@@ -159,7 +158,7 @@ fn blend<'a>(
         depth: Image::new(width, height, 1),
         stats: RasterStats { visible: rows.order.len(), ..Default::default() },
     };
-    let scene = scene(&projection, &rows, features, arch);
+    let scene = scene(&projection, &rows, features, level);
     let band = width * TILE;
     // Zero channels: every row gets an empty piece.
     let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
@@ -174,23 +173,23 @@ fn blend<'a>(
         .enumerate()
         .map(|(row, ((features, opacity), depth))| {
             let ranks = &rows.slot_rank[rows.row_start[row]..rows.row_start[row + 1]];
-            arch.dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
+            level.dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
         })
         .unzip();
     raster.stats.tile_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
     raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
     raster.stats.blended_pairs = works.iter().map(|w| w.blended).sum();
-    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists, arch }))
+    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists, level }))
 }
 
-fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features, arch: Arch) -> Scene<'a> {
+fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features, level: Level) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
         ellipses: &rows.ellipses,
         sources: &rows.sources,
         features,
-        stride: stride(features.channels, arch),
+        stride: stride(features.channels, level),
         channels: features.channels,
         limits: Thresholds {
             min_alpha: config.min_alpha,
@@ -204,8 +203,8 @@ fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features, ar
 }
 
 /// Values per splat in a row's copy of the features.
-fn stride(channels: usize, arch: Arch) -> usize {
-    (channels + 1).next_multiple_of(vector_width(arch).max(2 * GROUP))
+fn stride(channels: usize, level: Level) -> usize {
+    (channels + 1).next_multiple_of(level.width().max(2 * GROUP))
 }
 
 impl RasterPullback<'_> {
@@ -224,14 +223,14 @@ impl RasterPullback<'_> {
         check(&d.features, (width, height, self.features.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
-        let scene = scene(&self.projection, &self.rows, self.features, self.arch);
+        let scene = scene(&self.projection, &self.rows, self.features, self.level);
         let rows: Vec<RowGrad> = self
             .lists
             .par_iter()
             .enumerate()
             .map(|(row, lists)| {
                 let pixels = row * TILE * width..height.min((row + 1) * TILE) * width;
-                self.arch.dispatch(RowBackward {
+                self.level.dispatch(RowBackward {
                     scene: &scene,
                     row,
                     lists,
@@ -249,7 +248,7 @@ impl RasterPullback<'_> {
     fn gather(&self, parts: &[RowGrad]) -> RasterPull {
         let n = self.gaussians.len();
         let channels = self.features.channels;
-        let stride = stride(channels, self.arch);
+        let stride = stride(channels, self.level);
         let splats = &self.projection.splats;
         // By rank first: consecutive ranks read consecutive slots of every row.
         let mut features = vec![0.0f32; splats.len() * stride];
@@ -368,25 +367,27 @@ mod tests {
         for image in [&mut d.features, &mut d.opacity, &mut d.depth] {
             image.data_mut().iter_mut().enumerate().for_each(|(i, v)| *v = ((i * 7) % 11) as f32 - 5.0);
         }
-        let run = |arch| {
-            let (raster, pullback) = blend(Cow::Borrowed(&projection), &g, &features, arch).unwrap();
+        let run = |level| {
+            let (raster, pullback) = blend(Cow::Borrowed(&projection), &g, &features, level).unwrap();
             let pull = pullback.pull(&d).unwrap();
             (raster, pull)
         };
-        let (a, pull_a) = run(Arch::new());
-        let (b, pull_b) = run(Arch::Scalar);
         let close = |a: &[f32], b: &[f32], what: &str| {
             let (error, norm) = a.iter().zip(b).fold((0.0f64, 0.0f64), |(e, n), (x, y)| {
                 (e + (*x as f64 - *y as f64).powi(2), n + (*y as f64).powi(2))
             });
             assert!(error.sqrt() <= 2e-6 * norm.sqrt(), "{what}: {:.2e}", error.sqrt() / norm.sqrt());
         };
-        close(a.features.data(), b.features.data(), "features");
-        close(a.depth.data(), b.depth.data(), "depth");
-        close(&pull_a.features, &pull_b.features, "d features");
-        close(&pull_a.gaussians.opacities, &pull_b.gaussians.opacities, "d opacities");
         let flat = |v: &[Vec3]| v.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
-        close(&flat(&pull_a.gaussians.means), &flat(&pull_b.gaussians.means), "d means");
-        close(&flat(&pull_a.gaussians.scales), &flat(&pull_b.gaussians.scales), "d scales");
+        let (b, pull_b) = run(Level::native());
+        for level in [Level::Scalar, Level::Four, Level::Sixteen] {
+            let (a, pull_a) = run(level);
+            close(a.features.data(), b.features.data(), "features");
+            close(a.depth.data(), b.depth.data(), "depth");
+            close(&pull_a.features, &pull_b.features, "d features");
+            close(&pull_a.gaussians.opacities, &pull_b.gaussians.opacities, "d opacities");
+            close(&flat(&pull_a.gaussians.means), &flat(&pull_b.gaussians.means), "d means");
+            close(&flat(&pull_a.gaussians.scales), &flat(&pull_b.gaussians.scales), "d scales");
+        }
     }
 }
