@@ -36,7 +36,7 @@ pub use cpu::{CpuEngine, Profile};
 pub use engine::{Engine, Rendering, StepReport, TrainingPair};
 pub use error::ReconstructError;
 pub use model::Model;
-pub use objective::{TermValue, display_psnr};
+pub use objective::TermValue;
 pub use parameters::{Activated, ActivatedGrad, Attribute, GaussianParameters, Group, logit, sigmoid};
 pub use reconstruction::Reconstruction;
 pub use scene::{InitialPoints, Scene, survey};

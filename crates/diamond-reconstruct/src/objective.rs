@@ -61,13 +61,14 @@ fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
     target.data_mut().iter_mut().zip(from.data()).for_each(|(a, b)| *a += b * scale);
 }
 
+/// Identical pictures count as this many dB, as in `metrics.json`, so that means stay finite.
+const PSNR_CAP: f64 = 150.0;
+
 /// PSNR of two linear images in display sRGB, clamped, peak 1, dB.
-pub fn display_psnr(rendered: &Image, target: &Image) -> f32 {
-    let encode = |v: f32| Transfer::Srgb.encode(v).clamp(0.0, 1.0);
-    let sum: f64 =
-        rendered.data().iter().zip(target.data()).map(|(a, b)| ((encode(*a) - encode(*b)) as f64).powi(2)).sum();
-    let mean = sum / rendered.data().len().max(1) as f64;
-    (-10.0 * mean.max(1e-12).log10()) as f32
+fn display_psnr(rendered: &Image, target: &Image) -> Result<f32, ReconstructError> {
+    let display = |image: &Image| image.map(|v| Transfer::Srgb.encode(v).clamp(0.0, 1.0));
+    let psnr = diamond_metrics::psnr(&display(rendered), &display(target), 1.0).map_err(error::stage("PSNR"))?;
+    Ok(psnr.min(PSNR_CAP) as f32)
 }
 
 /// Value and gradient of every image term for one pair, with weight `share` in the batch.
@@ -157,7 +158,7 @@ pub fn evaluate(
         let grad = Image::from_vec(w, h, 1, l.d_incident).map_err(error::stage("incident term"))?;
         add_scaled(&mut out.shaded.maps.incident, &grad, share * loss.incident);
     }
-    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance) })
+    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance)? })
 }
 
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.
