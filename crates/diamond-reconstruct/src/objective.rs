@@ -198,25 +198,34 @@ pub fn visibility_term(
     Ok(TermValue { name: Term::Visibility.name(), weight: model.config.loss.visibility, value: l.value })
 }
 
-/// Shrinkage of the transfer vectors' bands: Σ l²·t² / N, so that light it has not seen is interpolated smoothly.
+/// Adds the shrinkage of the transfer vectors to a batch's gradient and terms, where the configuration weighs it.
 pub fn regularise(model: &Model, total: &mut ActivatedGrad, terms: &mut Terms) {
-    let weight = model.config.residual.transfer_smoothness;
-    if weight <= 0.0 || !model.config.residual.transfer {
+    let residual = &model.config.residual;
+    let weight = residual.transfer_smoothness;
+    if weight <= 0.0 || !residual.transfer {
         return;
     }
-    let degree = model.config.residual.transfer_degree;
     let values = model.parameters.values(Attribute::Transfer);
+    let (value, grad) = transfer_smoothness(values, residual.transfer_degree as usize, model.len());
     total.transfer.resize(values.len(), 0.0);
-    let coefficients = (degree as usize + 1) * (degree as usize + 1);
-    let scale = 1.0 / model.len().max(1) as f32;
+    total.transfer.iter_mut().zip(&grad).for_each(|(d, g)| *d += weight * g);
+    terms.add(&[TermValue { name: "transfer_smoothness", weight, value }], 1.0);
+}
+
+/// `[eq:transfer-smoothness]` Σ l²·t² / N over all coefficients t of band l = 0..=`degree` of N = `gaussians` transfer
+/// vectors (three colours each, bands in order), and its gradient: high bands shrink, so that lights that were not
+/// photographed are interpolated smoothly.
+fn transfer_smoothness(transfer: &[f32], degree: usize, gaussians: usize) -> (f32, Vec<f32>) {
+    let bands: Vec<f32> = (0..=degree).flat_map(|l| std::iter::repeat_n((l * l) as f32, 2 * l + 1)).collect();
+    let scale = 1.0 / gaussians.max(1) as f32;
     let mut sum = 0.0f64;
-    for (i, (&t, d)) in values.iter().zip(&mut total.transfer).enumerate() {
-        let band = ((i % coefficients) as f32).sqrt().floor();
-        let factor = band * band * scale;
-        sum += (factor * t * t) as f64;
-        *d += weight * 2.0 * factor * t;
-    }
-    terms.add(&[TermValue { name: "transfer_smoothness", weight, value: sum as f32 }], 1.0);
+    let grad = transfer.iter().enumerate().map(|(i, &t)| {
+        let factor = bands[i % bands.len()] * scale;
+        sum += f64::from(factor * t * t);
+        2.0 * factor * t
+    });
+    let grad = grad.collect();
+    (sum as f32, grad)
 }
 
 fn add_vec(to: &mut Vec<f32>, from: &[f32]) {
@@ -250,5 +259,40 @@ impl PairGrad {
         network.resize(self.network.len().max(network.len()), Vec::new());
         network.iter_mut().zip(&self.network).for_each(|(a, b)| add_vec(a, b));
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_testkit::{Dual, Real, gradient};
+
+    /// `[eq:transfer-smoothness]`: value and gradient against dual numbers, degrees 0 to 3.
+    #[test]
+    fn transfer_smoothness_agrees_with_dual_numbers() {
+        for degree in 0..=3usize {
+            let (n, k) = (2, (degree + 1) * (degree + 1));
+            let x: Vec<f64> = (0..n * 3 * k).map(|i| ((i * 37 + 11) % 23) as f64 / 11.5 - 1.0).collect();
+            let oracle = |t: &[Dual]| {
+                let mut sum = Dual::of(0.0);
+                for vector in t.chunks(k) {
+                    for l in 0..=degree {
+                        for m in 0..2 * l + 1 {
+                            let t = vector[l * l + m];
+                            sum += Dual::of((l * l) as f64 / n as f64) * t * t;
+                        }
+                    }
+                }
+                sum
+            };
+            let constants: Vec<Dual> = x.iter().map(|&v| Dual::of(v)).collect();
+            let f32s: Vec<f32> = x.iter().map(|&v| v as f32).collect();
+            let (value, grad) = transfer_smoothness(&f32s, degree, n);
+            let expected = oracle(&constants).v;
+            assert!((f64::from(value) - expected).abs() <= 1e-5 * (1.0 + expected), "{value} {expected}");
+            for (a, b) in grad.iter().zip(gradient(oracle, &x)) {
+                assert!((f64::from(*a) - b).abs() <= 1e-5 * (1.0 + b.abs()), "degree {degree}: {a} {b}");
+            }
+        }
     }
 }
