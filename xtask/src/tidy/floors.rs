@@ -50,6 +50,7 @@ pub const PACKAGES: &[Package] = &[
     Package { name: "diamond-image", floor: 0, outside: Some(&[]), optional: &[], alone: Some(&[]) },
     light("diamond-camera", 0, &["glam"]),
     light("diamond-light", 0, &["glam"]),
+    heavy("diamond-simd", 0, &["pulp"]),
     heavy(TESTKIT, 0, &["proptest"]),
     heavy("diamond-splat", 1, &["glam", "rayon", "pulp"]),
     Package {
