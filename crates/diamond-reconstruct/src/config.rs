@@ -2,7 +2,7 @@
 //!
 //! A file may name a `base` preset and say only what differs. Unknown keys are errors, so that a typing mistake never
 //! silently leaves a default in place. Step numbers are fractions of the run's length unless the name says `steps`.
-use crate::ReconstructError;
+use crate::{InstructionChoice, ReconstructError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -23,6 +23,10 @@ pub struct Config {
     pub accumulate: u32,
     /// Steps between checkpoints.
     pub checkpoint_steps: u64,
+    /// Instruction set of the kernels: `auto` (the fastest), `portable` (the same bits on every machine), `avx2`, `avx512`
+    /// or `neon` (the same bits as each other).
+    #[serde(default)]
+    pub instruction_set: InstructionChoice,
     /// How images are read.
     pub input: Input,
     /// How the Gaussians begin.

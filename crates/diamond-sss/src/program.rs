@@ -5,7 +5,7 @@ mod reconstruct;
 
 use clap::Parser;
 use cli::{Cli, Command, RenderArguments};
-use diamond_reconstruct::{Config, PRESETS};
+use diamond_reconstruct::{Config, InstructionChoice, PRESETS};
 use diamond_sss::{CameraChoice, LightChoice, RenderOptions, SssError};
 use progress::Counter;
 use std::io::Write;
@@ -39,7 +39,8 @@ fn print(text: &str) {
 fn run(command: Command) -> Result<(), SssError> {
     match command {
         Command::Reconstruct(arguments) => reconstruct::run(arguments),
-        Command::Evaluate { dir, capture, save_images } => {
+        Command::Evaluate { dir, capture, save_images, instruction_set } => {
+            choose_instructions(instruction_set)?;
             let mut counter = Counter::new("evaluating");
             let metrics =
                 diamond_sss::evaluate_folder(&dir, &capture, save_images, &mut |done, all| counter.show(done, all))?;
@@ -49,6 +50,7 @@ fn run(command: Command) -> Result<(), SssError> {
             Ok(())
         }
         Command::Render(arguments) => {
+            choose_instructions(arguments.instruction_set)?;
             let mut counter = Counter::new("rendering");
             let written =
                 diamond_sss::render_folder(&render_options(arguments)?, &mut |done, all| counter.show(done, all))?;
@@ -81,6 +83,10 @@ fn run(command: Command) -> Result<(), SssError> {
             Ok(())
         }
     }
+}
+
+fn choose_instructions(choice: Option<InstructionChoice>) -> Result<(), SssError> {
+    choice.unwrap_or_default().apply().map(drop).map_err(|e| SssError::Usage(e.to_string()))
 }
 
 fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {

@@ -6,7 +6,7 @@ use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
 use crate::{Metrics, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
 use diamond_dataset::{Capture, Selection};
-use diamond_reconstruct::{Config, Reconstruction, StepReport};
+use diamond_reconstruct::{Config, InstructionChoice, Reconstruction, StepReport};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,6 +27,8 @@ pub struct ReconstructOptions {
     pub seed: Option<u64>,
     /// Threads; all where absent. The result does not depend on it.
     pub threads: Option<usize>,
+    /// Instruction set; the configuration's where absent.
+    pub instruction_set: Option<InstructionChoice>,
     /// Training views.
     pub views: Selection,
     /// Training lights.
@@ -49,6 +51,7 @@ impl ReconstructOptions {
             steps: None,
             seed: None,
             threads: None,
+            instruction_set: None,
             views: Selection::All,
             lights: Selection::All,
             resume: false,
@@ -62,6 +65,7 @@ impl ReconstructOptions {
         let mut config = Config::load(&self.preset)?;
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
+        config.instruction_set = self.instruction_set.unwrap_or(config.instruction_set);
         config.validate(&self.preset)?;
         Ok(config)
     }
@@ -176,6 +180,7 @@ fn run(
 ) -> Result<Outcome, SssError> {
     let begun = Instant::now();
     let config = options.config()?;
+    let instruction_set = config.instruction_set.apply().map_err(|e| SssError::Usage(e.to_string()))?;
     let folder = options.output.as_path();
     let checkpoint = folder.join("checkpoint");
     if options.resume && options.force {
@@ -209,6 +214,7 @@ fn run(
         false => TrainingLog::new(config.steps),
     };
     let mut record = record_of(options, &config, &capture, capture_hash.clone());
+    record.instruction_set = instruction_set.to_string();
     record.write(folder)?;
     events(Event::Note(format!("first Gaussians: {}", training.initial_origin)));
     events(Event::Started { done: training.steps_done(), steps: config.steps, images: training.pair_count() });
@@ -278,6 +284,7 @@ fn record_of(options: &ReconstructOptions, config: &Config, capture: &Capture, c
         steps: config.steps,
         seed: config.seed,
         threads: rayon::current_num_threads(),
+        instruction_set: String::new(),
         training_images: capture.train.iter().map(|v| v.shots.len()).sum(),
         up: RunRecord::up_of(capture).into(),
         cameras: capture.train.iter().map(|v| StoredCamera::of(&v.name, &v.camera)).collect(),

@@ -134,6 +134,9 @@ pub struct RunRecord {
     pub seed: u64,
     /// Threads used (they change the speed and nothing else).
     pub threads: usize,
+    /// Instruction set of the kernels, which decides last bits; empty in records of earlier versions.
+    #[serde(default)]
+    pub instruction_set: String,
     /// Images learned from.
     pub training_images: usize,
     /// Unit vector that is upward in most training views, world.

@@ -1,6 +1,7 @@
 //! The words of the command line.
 use clap::{Args, Parser, Subcommand};
 use diamond_dataset::Selection;
+use diamond_reconstruct::InstructionChoice;
 use std::path::PathBuf;
 
 /// Reconstructs translucent objects from photographs under one light at a time, and shows them under any light.
@@ -32,6 +33,9 @@ pub enum Command {
         /// Also write DIR/images/{name}_{render,truth,flip}.png
         #[arg(long)]
         save_images: bool,
+        /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: auto]
+        #[arg(long, value_name = "NAME")]
+        instruction_set: Option<InstructionChoice>,
     },
     /// Render a model: any camera path, any light or mix of lights
     Render(RenderArguments),
@@ -91,6 +95,9 @@ pub struct ReconstructArguments {
     /// Threads; the result does not depend on it [default: all]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
     pub threads: Option<u16>,
+    /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: the configuration]
+    #[arg(long, value_name = "NAME")]
+    pub instruction_set: Option<InstructionChoice>,
     /// Training views: a count, or indices such as 0,5,7 or 0-7
     #[arg(long, default_value = "all")]
     pub views: Selection,
@@ -149,6 +156,9 @@ pub struct RenderArguments {
     /// Linear light as EXR instead of sRGB as PNG
     #[arg(long)]
     pub linear: bool,
+    /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: auto]
+    #[arg(long, value_name = "NAME")]
+    pub instruction_set: Option<InstructionChoice>,
 }
 
 fn at_least_one(text: &str) -> Result<usize, String> {

@@ -27,6 +27,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         steps: a.steps,
         seed: a.seed,
         threads: a.threads.map(usize::from),
+        instruction_set: a.instruction_set,
         views: a.views,
         lights: a.lights,
         resume: a.resume,

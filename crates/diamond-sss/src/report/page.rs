@@ -200,6 +200,7 @@ fn facts(out: &mut String, metrics: &Metrics, record: &RunRecord, model: &Model)
         ("Time", seconds),
         ("Peak memory", peak),
         ("Threads", record.threads.to_string()),
+        ("Instruction set", record.instruction_set.clone()),
         ("Version", record.version.clone()),
     ] {
         let _ = write!(out, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
