@@ -1,71 +1,86 @@
-//! Forward blending of one row of tiles.
+//! Forward blending of one row of blocks.
 //!
 //! Per block of 16 pixels and per batch of splats two phases alternate: first the weights `w = α·T` front to back, then
 //! `Σ w f` for four channels at a time with the sums in registers, which is a small matrix product and as fast as one.
 //! Depth is one more channel (the splat's z); opacity is the sum of the weights.
-use crate::Features;
-use crate::ellipse::{BLOCK, Ellipse, LANES, Prepared, TILE};
-use crate::lanes::{Block, Thresholds, alpha, any_positive, composite, load, store, with_lanes};
-use crate::tiles::{TileLists, entry_slot, tile_lists};
+use crate::bins::{BlockLists, ROW, ROW_BANDS, Slot};
+use crate::ellipse::{BLOCK, Ellipse, LANES, Prepared};
+use crate::lanes::{Block, Offsets, Thresholds, alpha, any_positive, composite, load, store, with_lanes};
 use pulp::{Simd, WithSimd};
 
-/// Entries of a tile that are prepared and blended together.
+/// Entries of a block that are prepared and blended together.
 const BATCH: usize = 32;
 /// Channels that are accumulated together.
 pub(crate) const GROUP: usize = 4;
 
-/// What every row of tiles needs to know.
+/// What every row needs to know.
 pub(crate) struct Scene<'a> {
     /// By rank.
     pub ellipses: &'a [Ellipse],
-    /// By rank: index of the Gaussian and depth.
-    pub sources: &'a [(u32, f32)],
-    /// By Gaussian.
-    pub features: &'a Features,
-    /// Of a row's own copy of the features; a multiple of [`GROUP`] and of the vector width.
+    /// By rank: the features, the depth, zeros up to the stride.
+    pub features: &'a [f32],
+    /// Of `features`; a multiple of [`GROUP`] and of the vector width.
     pub stride: usize,
     /// Without depth.
     pub channels: usize,
     pub limits: Thresholds,
     pub smooth: bool,
+    /// Whether weights above 0 are counted.
+    pub count: bool,
     pub width: usize,
     pub height: usize,
 }
 
-/// Offsets of the pixel centres of a block from the tile's centre: all x, then all y.
-pub(crate) fn block_offsets(block: usize) -> ([f32; LANES], [f32; LANES]) {
-    let corner = |b: usize| (b * BLOCK) as f32 + 0.5 - 0.5 * TILE as f32;
-    (
-        std::array::from_fn(|lane| corner(block % 2) + (lane % BLOCK) as f32),
-        std::array::from_fn(|lane| corner(block / 2) + (lane / BLOCK) as f32),
-    )
-}
-
-/// Offset of a block's centre from the tile's centre.
-#[inline(always)]
-pub(crate) fn block_centre(block: usize) -> (f32, f32) {
-    let half = 0.5 * BLOCK as f32;
-    (if block.is_multiple_of(2) { -half } else { half }, if block / 2 == 0 { -half } else { half })
+/// A block within a row.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Place {
+    pub row: usize,
+    pub band: usize,
+    pub block: usize,
 }
 
 impl Scene<'_> {
-    /// x of a tile's centre, px.
-    pub fn centre(tile: usize) -> f64 {
-        (tile * TILE) as f64 + 0.5 * TILE as f64
+    /// Blocks side by side.
+    pub fn blocks(&self) -> usize {
+        self.width.div_ceil(BLOCK)
     }
 
-    /// Index of a lane's pixel within the row of tiles, `None` outside the image.
+    /// Bands of row `row`: the last row of an image may have fewer than the others.
+    pub fn bands(&self, row: usize) -> usize {
+        (self.height - row * ROW).div_ceil(BLOCK).min(ROW_BANDS)
+    }
+
+    /// Centre of a block, px.
     #[inline(always)]
-    pub fn pixel(&self, tile: usize, row: usize, block: usize, lane: usize) -> Option<usize> {
-        let x = tile * TILE + block % 2 * BLOCK + lane % BLOCK;
-        let y = block / 2 * BLOCK + lane / BLOCK;
-        (x < self.width && row * TILE + y < self.height).then(|| y * self.width + x)
+    pub fn centre(&self, at: Place) -> (f64, f64) {
+        let half = 0.5 * BLOCK as f64;
+        ((at.block * BLOCK) as f64 + half, (at.row * ROW + at.band * BLOCK) as f64 + half)
+    }
+
+    /// Width and height of the part of a block that is inside the image, pixels.
+    #[inline(always)]
+    pub fn size(&self, at: Place) -> (usize, usize) {
+        let (x, y) = (at.block * BLOCK, at.row * ROW + at.band * BLOCK);
+        ((self.width - x).min(BLOCK), (self.height - y).min(BLOCK))
+    }
+
+    /// Index within the row of the first pixel of line `y` of a block.
+    #[inline(always)]
+    pub fn pixel(&self, at: Place, y: usize) -> usize {
+        (at.band * BLOCK + y) * self.width + at.block * BLOCK
     }
 
     /// 1 for lanes inside the image, else 0: the transmittance to start with.
     #[inline(always)]
-    pub fn initial_transmittance(&self, tile: usize, row: usize, block: usize) -> [f32; LANES] {
-        std::array::from_fn(|lane| if self.pixel(tile, row, block, lane).is_some() { 1.0 } else { 0.0 })
+    pub fn initial_transmittance(&self, at: Place) -> [f32; LANES] {
+        let (width, height) = self.size(at);
+        let mut t = [1.0; LANES];
+        if width < BLOCK || height < BLOCK {
+            for (lane, t) in t.iter_mut().enumerate() {
+                *t = (lane % BLOCK < width && lane / BLOCK < height) as u32 as f32;
+            }
+        }
+        t
     }
 
     /// Groups of channels that hold the features and the depth.
@@ -74,12 +89,11 @@ impl Scene<'_> {
     }
 }
 
-/// The forward pass of one row of tiles.
+/// The forward pass of one row.
 pub(crate) struct RowForward<'a> {
     pub scene: &'a Scene<'a>,
     pub row: usize,
-    /// Slot → rank.
-    pub ranks: &'a [u32],
+    pub slots: &'a [Slot],
     /// The row's pixels × channels.
     pub features: &'a mut [f32],
     /// The row's pixels.
@@ -93,15 +107,15 @@ pub(crate) struct RowForward<'a> {
 pub(crate) struct RowWork {
     /// (splat, pixel) pairs whose alpha was evaluated.
     pub evaluated: u64,
-    /// Those with a weight.
+    /// Those with a weight, if they were counted.
     pub blended: u64,
 }
 
 impl WithSimd for RowForward<'_> {
-    type Output = (TileLists, RowWork);
+    type Output = (BlockLists, RowWork);
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> (TileLists, RowWork) {
+    fn with_simd<S: Simd>(self, s: S) -> (BlockLists, RowWork) {
         if self.scene.smooth {
             with_lanes!(s: S, forward_row_smooth(self))
         } else {
@@ -111,98 +125,80 @@ impl WithSimd for RowForward<'_> {
 }
 
 #[inline(always)]
-fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (TileLists, RowWork) {
+fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (BlockLists, RowWork) {
     forward_row::<S, N, false>(s, row)
 }
 
 #[inline(always)]
-fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (TileLists, RowWork) {
+fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (BlockLists, RowWork) {
     forward_row::<S, N, true>(s, row)
 }
 
 #[inline(always)]
-fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForward) -> (TileLists, RowWork) {
-    let RowForward { scene, row, ranks, features, opacity, depth } = row;
-    let mut lists = tile_lists(scene.ellipses, ranks, row, scene.width, scene.height);
-    lists.features = vec![0.0; ranks.len() * scene.stride];
-    for (to, &rank) in lists.features.chunks_exact_mut(scene.stride).zip(ranks) {
-        let (gaussian, depth) = scene.sources[rank as usize];
-        to[..scene.channels].copy_from_slice(scene.features.row(gaussian as usize));
-        to[scene.channels] = depth;
-    }
+fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForward) -> (BlockLists, RowWork) {
+    let RowForward { scene, row, slots, features, opacity, depth } = work;
+    let mut lists = BlockLists::new(slots, scene.blocks());
     let groups = scene.groups();
-    let offsets: [_; 4] = std::array::from_fn(block_offsets);
-    // Per block: transmittance, opacity, count of blended pairs, sums by channel.
-    let mut t = [[0.0f32; LANES]; 4];
-    let mut acc = vec![[0.0f32; LANES]; 4 * groups * GROUP];
+    let offsets = Offsets::<S, N>::new();
+    // Sums by channel.
+    let mut acc = vec![[0.0f32; LANES]; groups * GROUP];
     let mut prepared = [Prepared::default(); BATCH];
-    // Where a splat's features begin.
+    // Where a splat's features begin: of the batch, and of those with a weight.
     let mut batch_rows = [0usize; BATCH];
+    let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
-    let mut sources = [0u32; BATCH];
     let mut work = RowWork::default();
-    for tile in 0..lists.reach.len() {
-        let entries = &lists.entries[lists.start[tile] as usize..lists.start[tile + 1] as usize];
-        let centre = Scene::centre(tile);
-        let reach = &mut lists.reach[tile];
-        for block in 0..4 {
-            t[block] = scene.initial_transmittance(tile, row, block);
-        }
-        let mut sum = [[0.0f32; LANES]; 4];
-        let mut blended = [0u32; LANES];
-        acc.fill([0.0; LANES]);
-        // Which blocks still let light through, as entry bits.
-        let mut open: u32 = (0..4).map(|b| ((t[b] != [0.0; LANES]) as u32) << b).sum();
-        for (batch, entries) in entries.chunks(BATCH).enumerate() {
-            if open == 0 {
-                break;
+    for band in 0..scene.bands(row) {
+        for block in 0..scene.blocks() {
+            let entries = lists.of(band, block);
+            if entries.is_empty() {
+                continue;
             }
-            for (k, &entry) in entries.iter().enumerate() {
-                let slot = entry_slot(entry);
-                batch_rows[k] = slot * scene.stride;
-                prepared[k] = lists.splats[slot].prepare(centre);
-            }
-            for block in 0..4 {
-                if open & 1 << block == 0 {
-                    continue;
+            let place = Place { row, band, block };
+            let (x, y) = scene.centre(place);
+            let mut t = load::<S, N>(&scene.initial_transmittance(place));
+            let mut sum = [s.splat_f32s(0.0); N];
+            acc.fill([0.0; LANES]);
+            let mut reach = 0;
+            for (batch, entries) in entries.chunks(BATCH).enumerate() {
+                for (k, &slot) in entries.iter().enumerate() {
+                    let rank = lists.ranks[slot as usize] as usize;
+                    batch_rows[k] = rank * scene.stride;
+                    prepared[k] = scene.ellipses[rank].prepare(x, y);
                 }
+                work.evaluated += (entries.len() * LANES) as u64;
                 // Phase 1: weights, front to back.
-                let (x, y) = (load::<S, N>(&offsets[block].0), load::<S, N>(&offsets[block].1));
-                let mut t_block = load::<S, N>(&t[block]);
-                let mut sum_block = load::<S, N>(&sum[block]);
                 let mut n = 0;
-                for (k, &entry) in entries.iter().enumerate() {
-                    if entry & 1 << block == 0 {
-                        continue;
-                    }
-                    work.evaluated += LANES as u64;
-                    let (a, _) = alpha::<S, N, SMOOTH>(s, &prepared[k], &x, &y, &scene.limits);
-                    let w = composite::<S, N>(s, &a, &mut t_block, &scene.limits);
+                let mut last = 0;
+                for k in 0..entries.len() {
+                    let (a, _) = alpha::<S, N, SMOOTH>(s, &prepared[k], &offsets, &scene.limits);
+                    let (w, any) = composite::<S, N>(s, &a, &mut t, &scene.limits);
                     for i in 0..N {
-                        sum_block[i] = s.add_f32s(sum_block[i], w[i]);
+                        sum[i] = s.add_f32s(sum[i], w[i]);
                     }
                     store::<S, N>(&mut weights[n], w);
-                    sources[n] = k as u32;
-                    n += any_positive::<S, N>(s, &w) as usize;
+                    rows[n] = batch_rows[k];
+                    n += any as usize;
+                    last = if any { k + 1 } else { last };
                 }
-                store::<S, N>(&mut t[block], t_block);
-                store::<S, N>(&mut sum[block], sum_block);
-                open &= !(((!any_positive::<S, N>(s, &t_block)) as u32) << block);
                 if n == 0 {
+                    if !any_positive::<S, N>(s, &t) {
+                        break;
+                    }
                     continue;
                 }
-                reach[block] = (batch * BATCH) as u32 + sources[n - 1] + 1;
+                reach = (batch * BATCH + last) as u32;
                 // Phase 2: Σ w f.
                 for group in 0..groups {
-                    let acc = &mut acc[(block * groups + group) * GROUP..][..GROUP];
+                    let acc = &mut acc[group * GROUP..][..GROUP];
                     let mut sums: [Block<S, N>; GROUP] = [[s.splat_f32s(0.0); N]; GROUP];
                     for c in 0..GROUP {
                         sums[c] = load::<S, N>(&acc[c]);
                     }
                     for m in 0..n {
                         let w = load::<S, N>(&weights[m]);
-                        let at = batch_rows[sources[m] as usize] + group * GROUP;
-                        let f = &lists.features[at..at + GROUP];
+                        let at = rows[m] + group * GROUP;
+                        let f = &scene.features[at..at + GROUP];
                         for c in 0..GROUP {
                             let f = s.splat_f32s(f[c]);
                             for i in 0..N {
@@ -214,24 +210,32 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowForwar
                         store::<S, N>(&mut acc[c], sums[c]);
                     }
                 }
-                for w in &weights[..n] {
-                    for lane in 0..LANES {
-                        blended[lane] += (w[lane] > 0.0) as u32;
-                    }
+                if scene.count {
+                    let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
+                    work.blended += weights[..n].iter().map(positive).sum::<u64>();
+                }
+                if !any_positive::<S, N>(s, &t) {
+                    break;
                 }
             }
-        }
-        for count in blended {
-            work.blended += count as u64;
-        }
-        for block in 0..4 {
-            for lane in 0..LANES {
-                if let Some(pixel) = scene.pixel(tile, row, block, lane) {
-                    let of = |c: usize| acc[block * groups * GROUP + c][lane];
-                    opacity[pixel] = sum[block][lane];
-                    depth[pixel] = of(scene.channels);
-                    let out = &mut features[pixel * scene.channels..][..scene.channels];
-                    out.iter_mut().enumerate().for_each(|(c, v)| *v = of(c));
+            lists.reach[band][block] = reach;
+            if reach == 0 {
+                continue;
+            }
+            let mut total = [0.0f32; LANES];
+            store::<S, N>(&mut total, sum);
+            let (width, height) = scene.size(place);
+            for y in 0..height {
+                let (first, lane) = (scene.pixel(place, y), y * BLOCK);
+                opacity[first..first + width].copy_from_slice(&total[lane..lane + width]);
+                depth[first..first + width].copy_from_slice(&acc[scene.channels][lane..lane + width]);
+                let out = &mut features[first * scene.channels..(first + width) * scene.channels];
+                if scene.channels > 0 {
+                    for (x, out) in out.chunks_exact_mut(scene.channels).enumerate() {
+                        for (c, v) in out.iter_mut().enumerate() {
+                            *v = acc[c][lane + x];
+                        }
+                    }
                 }
             }
         }

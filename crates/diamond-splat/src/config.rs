@@ -26,6 +26,8 @@ pub struct RasterConfig {
     pub near: f32,
     /// What happens at the alpha threshold.
     pub cutoff: Cutoff,
+    /// Whether [`RasterStats::blended_pairs`](crate::RasterStats::blended_pairs) is counted, which costs a few per cent.
+    pub count_blended: bool,
 }
 
 impl Default for RasterConfig {
@@ -37,6 +39,7 @@ impl Default for RasterConfig {
             min_transmittance: 1e-4,
             near: 0.2,
             cutoff: Cutoff::Hard,
+            count_blended: false,
         }
     }
 }

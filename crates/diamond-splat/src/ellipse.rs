@@ -1,14 +1,14 @@
 //! The ellipse of one splat in the units of the blend kernels, and which blocks of pixels it meets.
 //!
 //! Kernels evaluate alpha as a power of two: `α = 2^(log2 o − u² − v²)` with `(u, v) = κ·Lᵀd`, `κ² = ½·log2 e`. The
-//! pair `(u, v)` at a tile's centre is computed in f64, and inside a tile it is affine in small exact offsets, so its
+//! pair `(u, v)` at a block's centre is computed in f64, and inside a block it is affine in small exact offsets, so its
 //! error in f32 stays near 1e-7 even on long thin ellipses, where the usual `½(A dx² + C dy²) + B dx dy` loses four
 //! digits by cancellation.
 use crate::projection::Splat;
+use pulp::Simd;
 
-/// Side of a tile, pixels.
-pub(crate) const TILE: usize = 8;
-/// Side of a block, pixels; a tile has four blocks, numbered row by row.
+/// Side of a block, pixels. Blocks are what splats are binned to: on a processor, work that no pixel needs costs more
+/// than longer lists do.
 pub(crate) const BLOCK: usize = 4;
 /// Pixels of a block: the lanes that kernels work on.
 pub(crate) const LANES: usize = BLOCK * BLOCK;
@@ -25,21 +25,10 @@ pub(crate) struct Ellipse {
     mean: [f64; 2],
     /// κ·L: `l11, l21, l22`.
     chol: [f64; 3],
-    chol_f32: [f32; 3],
     log2_opacity: f32,
-    // The ellipse σ ≤ τ, relative to the mean.
-    two_tau: f32,
-    extent: [f32; 2],
-    /// y offset of the rightmost point.
-    y_of_rightmost: f32,
-    /// x of the centre line per unit of y.
-    slope: f32,
-    /// Half width of a row per unit of √(2τ − w₂²).
-    half_width: f32,
-    inv_sqrt_cov_yy: f32,
 }
 
-/// `(u, v)` at a tile's centre and its derivatives: what a kernel needs to know of one splat in one tile.
+/// `(u, v)` at a block's centre and its derivatives: what a kernel needs to know of one splat in one block.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Prepared {
     pub u: f32,
@@ -50,101 +39,106 @@ pub(crate) struct Prepared {
     pub log2_opacity: f32,
 }
 
-impl Prepared {
-    /// The same with the point of reference moved by that many pixels.
-    #[inline(always)]
-    pub fn moved(&self, (x, y): (f32, f32)) -> Prepared {
-        Prepared { u: self.u + self.u_x * x + self.u_y * y, v: self.v + self.v_y * y, ..*self }
-    }
-}
-
-/// A splat as one row of tiles needs it: small, because a row's worth of them should stay in the cache.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct RowSplat {
-    /// u at the row's centre line is `u_base + u_slope · x`, x in px. In f64, since the two terms cancel.
-    u_base: f64,
-    u_slope: f64,
-    v: f32,
-    u_x: f32,
-    u_y: f32,
-    v_y: f32,
-    log2_opacity: f32,
-}
-
-impl RowSplat {
-    /// The values at the tile whose centre has this x (px).
-    #[inline(always)]
-    pub fn prepare(&self, x: f64) -> Prepared {
-        Prepared {
-            u: (self.u_base + self.u_slope * x) as f32,
-            v: self.v,
-            u_x: self.u_x,
-            u_y: self.u_y,
-            v_y: self.v_y,
-            log2_opacity: self.log2_opacity,
-        }
-    }
-}
-
 impl Ellipse {
     pub fn new(s: &Splat) -> Self {
         let kappa = KAPPA2.sqrt();
-        let chol = s.chol.map(|v| v * kappa);
-        let [l11, l21, l22] = s.chol;
-        let ex = (s.two_tau * s.cov[0]).sqrt();
-        Self {
-            mean: s.mean,
-            chol,
-            chol_f32: chol.map(|v| v as f32),
-            log2_opacity: (s.opacity as f64).log2() as f32,
-            two_tau: s.two_tau as f32,
-            extent: s.extent,
-            y_of_rightmost: (s.cov[1] / s.cov[0] * ex) as f32,
-            slope: (-l21 / l11) as f32,
-            half_width: (1.0 / l11) as f32,
-            inv_sqrt_cov_yy: l22 as f32,
-        }
+        Self { mean: s.mean, chol: s.chol.map(|v| v * kappa), log2_opacity: s.log2_opacity }
     }
 
-    /// The values for a row of tiles whose centre line is at `y` (px).
+    /// The values for the block whose centre is at `(x, y)` (px).
     #[inline(always)]
-    pub fn in_row(&self, y: f64) -> RowSplat {
-        let dy = y - self.mean[1];
+    pub fn prepare(&self, x: f64, y: f64) -> Prepared {
+        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
         let [l11, l21, l22] = self.chol;
-        let [u_x, u_y, v_y] = self.chol_f32;
-        RowSplat {
-            u_base: l21 * dy - l11 * self.mean[0],
-            u_slope: l11,
+        Prepared {
+            u: (l11 * dx + l21 * dy) as f32,
             v: (l22 * dy) as f32,
-            u_x,
-            u_y,
-            v_y,
+            u_x: l11 as f32,
+            u_y: l21 as f32,
+            v_y: l22 as f32,
             log2_opacity: self.log2_opacity,
         }
     }
+}
 
-    /// The exact x-interval (px) of the part of the ellipse between the lines `y0` and `y1` (px); empty (first > last)
-    /// where it does not meet the band. `[eq:ellipse-band]`
-    #[inline(always)]
-    pub fn band(&self, y0: f64, y1: f64) -> (f32, f32) {
-        let [ex, ey] = self.extent;
-        let low = ((y0 - self.mean[1]) as f32).max(-ey);
-        let high = ((y1 - self.mean[1]) as f32).min(ey);
-        // The rightmost and the leftmost point of an ellipse's part in a band lie at the band's y nearest to theirs.
-        let right_y = self.y_of_rightmost.max(low).min(high);
-        let left_y = (-self.y_of_rightmost).max(low).min(high);
-        let (right_w, left_w) = (right_y * self.inv_sqrt_cov_yy, left_y * self.inv_sqrt_cov_yy);
-        let right = self.slope * right_y + self.half_width * (self.two_tau - right_w * right_w).max(0.0).sqrt();
-        let left = self.slope * left_y - self.half_width * (self.two_tau - left_w * left_w).max(0.0).sqrt();
-        let slack = INTERVAL_SLACK.0 + INTERVAL_SLACK.1 * ex;
-        let x = self.mean[0] as f32;
-        if low > high { (1.0, 0.0) } else { (x + left - slack, x + right + slack) }
+/// Bands whose spans are computed in one call of [`band_spans`].
+pub(crate) const BANDS: usize = 16;
+const STEPS: [f32; BANDS] = {
+    let mut steps = [0.0; BANDS];
+    let mut k = 0;
+    while k < BANDS {
+        steps[k] = (k * BLOCK) as f32;
+        k += 1;
     }
+    steps
+};
+
+/// The x-intervals (px) of the ellipse in consecutive bands of [`BLOCK`] rows of pixels, the first of which is `first`;
+/// only the first `count` (at most [`BANDS`]) are needed. Exact, between the outer pixel centres of a band; empty
+/// (low > high) where the ellipse does not meet the band. `[eq:ellipse-band]`
+#[inline(always)]
+pub(crate) fn band_spans<S: Simd>(s: S, splat: &Splat, first: usize, count: usize) -> ([f32; BANDS], [f32; BANDS]) {
+    let [l11, l21, l22] = splat.chol;
+    let [ex, ey] = splat.extent;
+    let set = |v: f32| s.splat_f32s(v);
+    // The ellipse σ ≤ τ relative to the mean: y of the rightmost point, x of the centre line per unit of y, half the
+    // width of a row per unit of √(2τ − w₂²), w₂ = y/√cov_yy.
+    let rightmost = (splat.cov[1] / splat.cov[0]) as f32 * ex;
+    let (rightmost, leftmost) = (set(rightmost), set(-rightmost));
+    let (slope, half_width, inv_sqrt) = (set((-l21 / l11) as f32), set((1.0 / l11) as f32), set(l22 as f32));
+    let (two_tau, zero) = (set(splat.two_tau as f32), set(0.0));
+    let slack = INTERVAL_SLACK.0 + INTERVAL_SLACK.1 * ex;
+    let (x_low, x_high) = (set(splat.mean[0] as f32 - slack), set(splat.mean[0] as f32 + slack));
+    let top = set(((first * BLOCK) as f64 + 0.5 - splat.mean[1]) as f32);
+    let (top_limit, bottom_limit, height) = (set(-ey), set(ey), set((BLOCK - 1) as f32));
+    let (never_low, never_high) = (set(f32::MAX), set(f32::MIN));
+    let (mut low, mut high) = ([0.0f32; BANDS], [0.0f32; BANDS]);
+    let (steps, _) = S::as_simd_f32s(&STEPS);
+    let (lows, _) = S::as_mut_simd_f32s(&mut low);
+    let (highs, _) = S::as_mut_simd_f32s(&mut high);
+    for k in 0..count.div_ceil(S::F32_LANES).min(steps.len()) {
+        let y = s.add_f32s(top, steps[k]);
+        let y0 = s.max_f32s(y, top_limit);
+        let y1 = s.min_f32s(s.add_f32s(y, height), bottom_limit);
+        // The rightmost and the leftmost point of an ellipse's part in a band lie at the band's y nearest to theirs.
+        let right_y = s.min_f32s(s.max_f32s(rightmost, y0), y1);
+        let left_y = s.min_f32s(s.max_f32s(leftmost, y0), y1);
+        let (right_w, left_w) = (s.mul_f32s(right_y, inv_sqrt), s.mul_f32s(left_y, inv_sqrt));
+        let right_root = s.sqrt_f32s(s.max_f32s(s.sub_f32s(two_tau, s.mul_f32s(right_w, right_w)), zero));
+        let left_root = s.sqrt_f32s(s.max_f32s(s.sub_f32s(two_tau, s.mul_f32s(left_w, left_w)), zero));
+        let right = s.mul_add_e_f32s(half_width, right_root, s.mul_add_e_f32s(slope, right_y, x_high));
+        let left = s.sub_f32s(s.mul_add_e_f32s(slope, left_y, x_low), s.mul_f32s(half_width, left_root));
+        let meets = s.less_than_or_equal_f32s(y0, y1);
+        lows[k] = s.select_f32s(meets, left, never_low);
+        highs[k] = s.select_f32s(meets, right, never_high);
+    }
+    (low, high)
+}
+
+/// The blocks (first, one past last) of `blocks` that have a pixel centre between `low` and `high` (px); empty
+/// (0, 0) where there is none. A block's outer pixel centres are at 4b + 0.5 and 4b + 3.5.
+#[inline(always)]
+pub(crate) fn block_span(low: f32, high: f32, blocks: f32) -> (u16, u16) {
+    // Conversion to integers rounds toward zero.
+    let first = ((low + 0.5) * 0.25).max(0.0).min(blocks) as i32 as u16;
+    let past = ((high + 3.5) * 0.25).max(0.0).min(blocks) as i32 as u16;
+    if first < past { (first, past) } else { (0, 0) }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lanes::Level;
+
+    struct Band(Splat);
+
+    impl pulp::WithSimd for Band {
+        type Output = ([f32; BANDS], [f32; BANDS]);
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, s: S) -> Self::Output {
+            band_spans(s, &self.0, 0, BANDS)
+        }
+    }
 
     /// [eq:ellipse-band]: against a brute-force walk along the ellipse's boundary.
     #[test]
@@ -165,7 +159,11 @@ mod tests {
             };
             let y0 = splat.mean[1] + 12.0 * (r(7) - 0.7);
             let y1 = y0 + 3.0;
-            let (lo, hi) = Ellipse::new(&splat).band(y0, y1);
+            // Bands begin at multiples of the block: the splat is moved instead of the band.
+            let shift = 0.5 - y0;
+            let moved = Splat { mean: [splat.mean[0], splat.mean[1] + shift], ..splat };
+            let (low, high) = Level::native().dispatch(Band(moved));
+            let (lo, hi) = (low[0], high[0]);
             let (mut seen_lo, mut seen_hi) = (f64::MAX, f64::MIN);
             for k in 0..=3000 {
                 let dy = y0 + (y1 - y0) * k as f64 / 3000.0 - splat.mean[1];

@@ -6,7 +6,7 @@
 //!
 //! No vector operation may sit in a closure: a closure that is handed to a function of the standard library (such as
 //! `std::array::from_fn`) is compiled without the instruction set, and every operation in it becomes a call.
-use crate::ellipse::{LANES, Prepared};
+use crate::ellipse::{BLOCK, LANES, Prepared};
 use pulp::Simd;
 
 /// A block's worth of values.
@@ -59,6 +59,32 @@ pub(crate) struct Thresholds {
     pub min_transmittance: f32,
 }
 
+/// Offsets of the pixel centres of a block from its centre, px.
+#[derive(Clone, Copy)]
+pub(crate) struct Offsets<S: Simd, const N: usize> {
+    pub x: Block<S, N>,
+    pub y: Block<S, N>,
+}
+
+/// x of every lane from the block's centre, then y.
+pub(crate) const OFFSETS: [[f32; LANES]; 2] = {
+    let mut offsets = [[0.0; LANES]; 2];
+    let mut lane = 0;
+    while lane < LANES {
+        offsets[0][lane] = (lane % BLOCK) as f32 + 0.5 - 0.5 * BLOCK as f32;
+        offsets[1][lane] = (lane / BLOCK) as f32 + 0.5 - 0.5 * BLOCK as f32;
+        lane += 1;
+    }
+    offsets
+};
+
+impl<S: Simd, const N: usize> Offsets<S, N> {
+    #[inline(always)]
+    pub fn new() -> Self {
+        Self { x: load::<S, N>(&OFFSETS[0]), y: load::<S, N>(&OFFSETS[1]) }
+    }
+}
+
 /// Alpha of one splat on a block `[eq:splat-alpha]`, and `−dα/dσ`, which is also `opacity · dα/d opacity`.
 ///
 /// Hard: `a = o·e^−σ`, `α = min(a, max_alpha)` where `a ≥ min_alpha`, else 0. Smooth: times the smoothstep of
@@ -67,8 +93,7 @@ pub(crate) struct Thresholds {
 pub(crate) fn alpha<S: Simd, const N: usize, const SMOOTH: bool>(
     s: S,
     p: &Prepared,
-    x: &Block<S, N>,
-    y: &Block<S, N>,
+    at: &Offsets<S, N>,
     limits: &Thresholds,
 ) -> (Block<S, N>, Block<S, N>) {
     let zero = s.splat_f32s(0.0);
@@ -77,11 +102,15 @@ pub(crate) fn alpha<S: Simd, const N: usize, const SMOOTH: bool>(
     let (u_y, v_y, log2_opacity) = (s.splat_f32s(p.u_y), s.splat_f32s(p.v_y), s.splat_f32s(p.log2_opacity));
     let mut alphas = [zero; N];
     let mut chains = [zero; N];
+    // Whole rows of a block in a vector: all vectors have the same x.
+    let shared = s.mul_add_e_f32s(u_x, at.x[0], u0);
     for i in 0..N {
-        let u = s.mul_add_e_f32s(u_x, x[i], s.mul_add_e_f32s(u_y, y[i], u0));
-        let v = s.mul_add_e_f32s(v_y, y[i], v0);
-        let q = s.mul_add_e_f32s(u, u, s.mul_f32s(v, v));
-        let a = exp2(s, s.sub_f32s(log2_opacity, q));
+        let along_x =
+            if S::F32_LANES.is_multiple_of(BLOCK) { shared } else { s.mul_add_e_f32s(u_x, at.x[i], u0) };
+        let u = s.mul_add_e_f32s(u_y, at.y[i], along_x);
+        let v = s.mul_add_e_f32s(v_y, at.y[i], v0);
+        let exponent = s.negate_mul_add_e_f32s(u, u, s.negate_mul_add_e_f32s(v, v, log2_opacity));
+        let a = exp2(s, exponent);
         let keep = s.greater_than_or_equal_f32s(a, min);
         let clamped = s.min_f32s(a, max);
         let free = s.less_than_or_equal_f32s(a, max);
@@ -105,34 +134,38 @@ pub(crate) fn alpha<S: Simd, const N: usize, const SMOOTH: bool>(
 
 /// One step of front-to-back compositing `[eq:splat-blend]`: the weight `α·T`, and the transmittance after it; both 0
 /// once a pixel has stopped, which it does before the splat that would bring T to `min_transmittance` or below.
+/// Returns the weights and whether any is above 0.
 #[inline(always)]
 pub(crate) fn composite<S: Simd, const N: usize>(
     s: S,
     alpha: &Block<S, N>,
     t: &mut Block<S, N>,
     limits: &Thresholds,
-) -> Block<S, N> {
-    let (zero, one) = (s.splat_f32s(0.0), s.splat_f32s(1.0));
+) -> (Block<S, N>, bool) {
+    let zero = s.splat_f32s(0.0);
     let stop = s.splat_f32s(limits.min_transmittance);
     let mut weights = [zero; N];
+    let mut any = s.greater_than_f32s(zero, zero);
     for i in 0..N {
-        let next = s.mul_f32s(t[i], s.sub_f32s(one, alpha[i]));
+        let next = s.negate_mul_add_e_f32s(t[i], alpha[i], t[i]);
         let weight = s.mul_f32s(t[i], alpha[i]);
         let go = s.greater_than_f32s(next, stop);
         t[i] = s.select_f32s(go, next, zero);
         weights[i] = s.select_f32s(go, weight, zero);
+        any = s.or_m32s(any, s.greater_than_f32s(weights[i], zero));
     }
-    weights
+    (weights, s.first_true_m32s(any) < S::F32_LANES)
 }
 
 /// Whether any value is above 0.
 #[inline(always)]
 pub(crate) fn any_positive<S: Simd, const N: usize>(s: S, values: &Block<S, N>) -> bool {
-    let mut largest = values[0];
+    let zero = s.splat_f32s(0.0);
+    let mut any = s.greater_than_f32s(values[0], zero);
     for v in &values[1..] {
-        largest = s.max_f32s(largest, *v);
+        any = s.or_m32s(any, s.greater_than_f32s(*v, zero));
     }
-    s.reduce_max_f32s(largest) > 0.0
+    s.first_true_m32s(any) < S::F32_LANES
 }
 
 /// Runs `$body::<S, N>($args)` with the N that belongs to the instruction set.

@@ -1,6 +1,7 @@
 //! Anisotropic Gaussians and the N-channel tile rasteriser that blends them, forward and backward, on the CPU.
 //!
 //! Invariant: this crate knows nothing of materials, lights or images from disk: it blends feature channels.
+mod bins;
 mod blend;
 mod bvh;
 mod config;
@@ -16,7 +17,6 @@ mod ply;
 mod projection;
 mod pullback;
 mod rasterize;
-mod tiles;
 mod visibility;
 
 pub use config::{Cutoff, RasterConfig};

@@ -41,6 +41,8 @@ pub(crate) struct Splat {
     pub depth: f32,
     /// Opacity.
     pub opacity: f32,
+    /// Its logarithm to base 2.
+    pub log2_opacity: f32,
     /// Projected mean, px.
     pub mean: [f64; 2],
     /// Screen covariance with low-pass: xx, xy, yy.
@@ -197,7 +199,8 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
     let cov = [xx + low, xy, yy + low];
     let mean = [view.f[0] * lin.p[0] / z + view.c[0], view.f[1] * lin.p[1] / z + view.c[1]];
     let chol = [(cov[2] / det).sqrt(), -cov[1] / (cov[2] * det).sqrt(), 1.0 / cov[2].sqrt()];
-    let tau = (opacity as f64 / config.min_alpha as f64).ln().max(0.0);
+    let log2_opacity = (opacity as f64).log2();
+    let tau = ((log2_opacity - (config.min_alpha as f64).log2()) * std::f64::consts::LN_2).max(0.0);
     let two_tau = 2.0 * tau * (1.0 + EXTENT_SLACK) + EXTENT_SLACK;
     let (ex, ey) = ((two_tau * cov[0]).sqrt(), (two_tau * cov[2]).sqrt());
     let finite = within(&mean, MAX_MEAN) && within(&cov, MAX_COVARIANCE) && within(&chol, MAX_MEAN) && det.is_finite();
@@ -207,6 +210,7 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
         gaussian: i as u32,
         depth: z as f32,
         opacity,
+        log2_opacity: log2_opacity as f32,
         mean,
         cov,
         chol,

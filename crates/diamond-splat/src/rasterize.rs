@@ -1,11 +1,11 @@
 //! The rasteriser's front: `rasterize`, what it returns, and the pullback that belongs to it.
-use crate::blend::{GROUP, RowForward, RowWork, Scene};
-use crate::ellipse::{KAPPA2, TILE};
+use crate::bins::{BlockLists, ROW, Rows, assign_rows};
+use crate::blend::{RowForward, RowWork, Scene};
+use crate::ellipse::KAPPA2;
 use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::{Level, Thresholds};
 use crate::projection::{is_smooth, project};
-use crate::pullback::{Moments, RowBackward, RowGrad};
-use crate::tiles::{Rows, TileLists, assign_rows};
+use crate::pullback::{GEOMETRY, RowBackward};
 use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -34,12 +34,13 @@ pub struct Raster {
 pub struct RasterStats {
     /// Gaussians that could contribute.
     pub visible: usize,
-    /// (Gaussian, 8 × 8 tile) pairs.
-    pub tile_entries: u64,
+    /// (Gaussian, block of 4 × 4 pixels) pairs.
+    pub block_entries: u64,
     /// (Gaussian, pixel) pairs whose alpha was evaluated.
     pub evaluated_pairs: u64,
-    /// (Gaussian, pixel) pairs with a weight above 0.
-    pub blended_pairs: u64,
+    /// (Gaussian, pixel) pairs with a weight above 0; `None` unless
+    /// [`count_blended`](crate::RasterConfig::count_blended).
+    pub blended_pairs: Option<u64>,
 }
 
 /// Cotangent of [`Raster`]: images of the same shapes.
@@ -71,7 +72,9 @@ pub struct RasterPullback<'a> {
     projection: Cow<'a, Projection>,
     features: &'a Features,
     rows: Rows,
-    lists: Vec<TileLists>,
+    /// By rank: features, depth, zeros up to the stride.
+    ranked: Vec<f32>,
+    lists: Vec<BlockLists>,
     /// The instruction set of the forward pass: the reverse must see the same bits.
     level: Level,
 }
@@ -149,7 +152,9 @@ fn blend<'a>(
     if let Some(&i) = projection.visible().iter().find(|&&i| !features.row(i as usize).iter().all(|v| v.is_finite())) {
         return Err(SplatError::NonFinite { what: "Features::data (row of Gaussian)", index: i as usize });
     }
-    let rows = assign_rows(&projection);
+    let rows = assign_rows(&projection, level);
+    let stride = stride(channels, level);
+    let ranked = ranked_features(&projection, &rows.order, features, stride);
     let k = &projection.camera.intrinsics;
     let (width, height) = (k.width as usize, k.height as usize);
     let mut raster = Raster {
@@ -158,53 +163,73 @@ fn blend<'a>(
         depth: Image::new(width, height, 1),
         stats: RasterStats { visible: rows.order.len(), ..Default::default() },
     };
-    let scene = scene(&projection, &rows, features, level);
-    let band = width * TILE;
+    let scene = scene(&projection, &rows, &ranked, channels, level);
+    let band = width * ROW;
     // Zero channels: every row gets an empty piece.
     let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
-        (0..height.div_ceil(TILE)).map(|_| Default::default()).collect()
+        (0..rows.len()).map(|_| Default::default()).collect()
     } else {
         raster.features.data_mut().chunks_mut(band * channels).collect()
     };
-    let (lists, works): (Vec<TileLists>, Vec<RowWork>) = feature_rows
+    let (lists, works): (Vec<BlockLists>, Vec<RowWork>) = feature_rows
         .par_iter_mut()
         .zip(raster.opacity.data_mut().par_chunks_mut(band))
         .zip(raster.depth.data_mut().par_chunks_mut(band))
         .enumerate()
         .map(|(row, ((features, opacity), depth))| {
-            let ranks = &rows.slot_rank[rows.row_start[row]..rows.row_start[row + 1]];
-            level.dispatch(RowForward { scene: &scene, row, ranks, features, opacity, depth })
+            let slots = &rows.slots(row);
+            level.dispatch(RowForward { scene: &scene, row, slots, features, opacity, depth })
         })
         .unzip();
-    raster.stats.tile_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
+    raster.stats.block_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
     raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
-    raster.stats.blended_pairs = works.iter().map(|w| w.blended).sum();
-    Ok((raster, RasterPullback { gaussians, features, projection, rows, lists, level }))
+    raster.stats.blended_pairs = projection.config.count_blended.then(|| works.iter().map(|w| w.blended).sum());
+    Ok((raster, RasterPullback { gaussians, features, projection, rows, ranked, lists, level }))
 }
 
-fn scene<'a>(projection: &Projection, rows: &'a Rows, features: &'a Features, level: Level) -> Scene<'a> {
+fn scene<'a>(
+    projection: &Projection,
+    rows: &'a Rows,
+    ranked: &'a [f32],
+    channels: usize,
+    level: Level,
+) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
         ellipses: &rows.ellipses,
-        sources: &rows.sources,
-        features,
-        stride: stride(features.channels, level),
-        channels: features.channels,
+        features: ranked,
+        stride: stride(channels, level),
+        channels,
         limits: Thresholds {
             min_alpha: config.min_alpha,
             max_alpha: config.max_alpha,
             min_transmittance: if smooth { -1.0 } else { config.min_transmittance },
         },
         smooth,
+        count: config.count_blended,
         width: projection.camera.intrinsics.width as usize,
         height: projection.camera.intrinsics.height as usize,
     }
 }
 
-/// Values per splat in a row's copy of the features.
+/// Values per splat in [`ranked_features`].
 fn stride(channels: usize, level: Level) -> usize {
-    (channels + 1).next_multiple_of(level.width().max(2 * GROUP))
+    (channels + 1).next_multiple_of(level.width().max(GEOMETRY))
+}
+
+/// The features of the visible Gaussians in depth order, each followed by its depth and zeros up to the stride: what
+/// blocks read next lies close by.
+fn ranked_features(projection: &Projection, order: &[u32], features: &Features, stride: usize) -> Vec<f32> {
+    let mut ranked = vec![0.0f32; order.len() * stride];
+    ranked.par_chunks_mut(stride * PIECE).zip(order.par_chunks(PIECE)).for_each(|(lines, order)| {
+        for (line, &i) in lines.chunks_exact_mut(stride).zip(order) {
+            let splat = &projection.splats[i as usize];
+            line[..features.channels].copy_from_slice(features.row(splat.gaussian as usize));
+            line[features.channels] = splat.depth;
+        }
+    });
+    ranked
 }
 
 impl RasterPullback<'_> {
@@ -223,42 +248,44 @@ impl RasterPullback<'_> {
         check(&d.features, (width, height, self.features.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
-        let scene = scene(&self.projection, &self.rows, self.features, self.level);
-        let rows: Vec<RowGrad> = self
+        let channels = self.features.channels;
+        let scene = scene(&self.projection, &self.rows, &self.ranked, channels, self.level);
+        let parts: Vec<Vec<f32>> = self
             .lists
             .par_iter()
             .enumerate()
             .map(|(row, lists)| {
-                let pixels = row * TILE * width..height.min((row + 1) * TILE) * width;
+                let pixels = row * ROW * width..height.min((row + 1) * ROW) * width;
                 self.level.dispatch(RowBackward {
                     scene: &scene,
                     row,
                     lists,
-                    d_features: &d.features.data()
-                        [pixels.start * self.features.channels..pixels.end * self.features.channels],
+                    d_features: &d.features.data()[pixels.start * channels..pixels.end * channels],
                     d_opacity: &d.opacity.data()[pixels.clone()],
                     d_depth: &d.depth.data()[pixels],
                 })
             })
             .collect();
-        Ok(self.gather(&rows))
+        Ok(self.gather(&parts))
     }
 
     /// Sums the rows' contributions per splat, in order of rows, and pulls them through the projection.
-    fn gather(&self, parts: &[RowGrad]) -> RasterPull {
+    fn gather(&self, parts: &[Vec<f32>]) -> RasterPull {
         let n = self.gaussians.len();
         let channels = self.features.channels;
-        let stride = stride(channels, self.level);
+        let line = GEOMETRY + stride(channels, self.level);
         let splats = &self.projection.splats;
         // By rank first: consecutive ranks read consecutive slots of every row.
-        let mut features = vec![0.0f32; splats.len() * stride];
-        let mut moments = vec![Moments::default(); splats.len()];
-        features
-            .par_chunks_mut(stride)
-            .zip(&mut moments)
-            .with_min_len(512)
-            .enumerate()
-            .for_each(|(rank, (features, moments))| self.sum_rows(rank, parts, features, moments));
+        let mut sums = vec![0.0f32; splats.len() * line];
+        sums.par_chunks_mut(line * Rows::RUN).enumerate().for_each(|(run, sums)| {
+            self.rows.for_each_rank(run, |rank, slots| {
+                let to = &mut sums[(rank - run * Rows::RUN) * line..][..line];
+                for (row, slot) in slots {
+                    let from = &parts[row][slot * line..][..line];
+                    to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
+                }
+            });
+        });
         // Then by Gaussian, in pieces of the ascending list of splats.
         let mut rank_of = vec![0u32; splats.len()];
         for (rank, &i) in self.rows.order.iter().enumerate() {
@@ -289,42 +316,29 @@ impl RasterPullback<'_> {
                     if i >= PIECE {
                         break;
                     }
-                    let line = &features[rank * stride..][..stride];
-                    let footprint = moments[rank].footprint_grad(splat.chol, line[channels] as f64);
+                    let (moments, features) = sums[rank * line..][..line].split_at(GEOMETRY);
+                    let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
                     let d = project_pull(self.gaussians, gaussian, &view, &footprint);
                     (means[i], scales[i], rotations[i]) = (d.mean, d.scale, d.rotation);
-                    opacities[i] = finite_f32(moments[rank].one / splat.opacity as f64);
+                    opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
                     screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
-                    d_features[i * channels..(i + 1) * channels].copy_from_slice(&line[..channels]);
+                    d_features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);
                 }
             });
         RasterPull { gaussians: g, features: d_features, screen }
     }
-
-    fn sum_rows(&self, rank: usize, parts: &[RowGrad], features: &mut [f32], moments: &mut Moments) {
-        let first_row = self.rows.spans[rank].0 as usize;
-        let slots = &self.rows.rank_slots[self.rows.rank_start[rank]..self.rows.rank_start[rank + 1]];
-        for (row, &slot) in (first_row..).zip(slots) {
-            let slot = slot as usize - self.rows.row_start[row];
-            moments.add(&parts[row].moments[slot]);
-            let line = &parts[row].features[slot * features.len()..][..features.len()];
-            features.iter_mut().zip(line).for_each(|(a, b)| *a += b);
-        }
-    }
 }
 
-impl Moments {
-    /// Whitened moments to the cotangent of mean and covariance `[eq:splat-footprint-pull]`:
-    /// `d/d mean = L Σ g w`, `d/d Σ = ½ L (Σ g w wᵀ) Lᵀ` with `w = Lᵀd`.
-    fn footprint_grad(&self, [l11, l21, l22]: [f64; 3], d_depth: f64) -> FootprintGrad {
-        let (inv, half) = (1.0 / KAPPA2.sqrt(), 0.5 / KAPPA2);
-        let [u, v] = self.first.map(|m| m * inv);
-        let [uu, uv, vv] = self.second.map(|m| m * half);
-        FootprintGrad {
-            mean: [l11 * u, l21 * u + l22 * v],
-            cov: [l11 * l11 * uu, l11 * (l21 * uu + l22 * uv), l21 * l21 * uu + 2.0 * l21 * l22 * uv + l22 * l22 * vv],
-            depth: d_depth,
-        }
+/// Whitened moments to the cotangent of mean and covariance `[eq:splat-footprint-pull]`:
+/// `d/d mean = L Σ g w`, `d/d Σ = ½ L (Σ g w wᵀ) Lᵀ` with `w = Lᵀd`.
+fn footprint_grad(moments: &[f32], [l11, l21, l22]: [f64; 3], d_depth: f64) -> FootprintGrad {
+    let (inv, half) = (1.0 / KAPPA2.sqrt(), 0.5 / KAPPA2);
+    let [u, v] = [moments[1], moments[2]].map(|m| m as f64 * inv);
+    let [uu, uv, vv] = [moments[3], moments[4], moments[5]].map(|m| m as f64 * half);
+    FootprintGrad {
+        mean: [l11 * u, l21 * u + l22 * v],
+        cov: [l11 * l11 * uu, l11 * (l21 * uu + l22 * uv), l21 * l21 * uu + 2.0 * l21 * l22 * uv + l22 * l22 * vv],
+        depth: d_depth,
     }
 }
 
