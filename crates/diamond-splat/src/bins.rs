@@ -1,184 +1,60 @@
-//! Who is blended where, and in which order: depth order, rows, blocks.
+//! Who is blended where, and in which order: rows, depth order within a row, blocks.
 //!
 //! A row of the image, two bands of 4 × 4 blocks high, is the unit of work of a thread: it owns a contiguous piece of
-//! the image, so rows run in parallel without sharing anything. Splats are sorted by view-space z once (ties by index).
-//! Runs of consecutive ranks are then bucketed by row, each run on its own; a row's list is the concatenation of its
-//! buckets, so that it is in depth order and nothing is shared here either. A splat's place in a row's list is its slot.
+//! the image, so rows run in parallel without sharing anything. Runs of consecutive Gaussians are projected and
+//! bucketed by row, each run on its own; a row's list is the concatenation of its buckets, so nothing is shared here
+//! either. A splat's place in a row's list is its slot. Each row sorts its slots by view-space z, ties by index, which
+//! costs less than one large sort, because everything that a row reads then lies close together.
 use crate::ellipse::{BANDS, BLOCK, Ellipse, band_spans, block_span};
-use crate::lanes::Level;
-use crate::projection::{Projection, Splat};
-use pulp::{Simd, WithSimd};
-use rayon::prelude::*;
+use crate::projection::{Outline, Splat};
+use pulp::Simd;
+use std::ops::Range;
 
 /// Bands of a row.
 pub(crate) const ROW_BANDS: usize = 2;
 /// Height of a row, pixels.
 pub(crate) const ROW: usize = ROW_BANDS * BLOCK;
-/// Ranks per run.
-const RUN: usize = 1024;
 
-/// A splat in a row: its rank, and per band the blocks (first, one past last) that it meets.
+/// A splat in a row: its index in its run, and per band the blocks (first, one past last) that it meets.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Slot {
-    pub rank: u32,
+    pub splat: u32,
     pub spans: [(u16, u16); ROW_BANDS],
 }
 
-/// Consecutive ranks, bucketed by row.
+/// The splats of consecutive Gaussians, bucketed by row.
 #[derive(Debug, Clone, Default)]
-struct Run {
-    /// By row, then rank.
+pub(crate) struct Run {
+    /// In order of Gaussians.
+    pub splats: Vec<Splat>,
+    /// By row, then splat.
     slots: Vec<Slot>,
     /// Slots of row `r` are `row_start[r]..row_start[r + 1]`.
     row_start: Vec<u32>,
-    /// By rank: the rows (first, one past last).
+    /// By splat: the rows (first, one past last).
     rows: Vec<(u32, u32)>,
-    /// By rank, then row: place in the row's bucket.
+    /// By splat, then row: place in the row's bucket.
     places: Vec<u32>,
 }
 
-/// Splats in depth order and the rows that they meet.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Rows {
-    /// Rank in depth → index into the projection's splats.
-    pub order: Vec<u32>,
-    /// By rank.
-    pub ellipses: Vec<Ellipse>,
-    runs: Vec<Run>,
-    /// By run, then row: the row's slots before this run.
-    slot_base: Vec<u32>,
-    rows: usize,
-}
-
-/// Sorts by depth and assigns rows.
-pub(crate) fn assign_rows(projection: &Projection, level: Level) -> Rows {
-    let splats = &projection.splats;
-    let k = &projection.camera.intrinsics;
-    let rows = (k.height as usize).div_ceil(ROW);
-    let blocks = (k.width as usize).div_ceil(BLOCK) as f32;
-    let order = depth_order(splats);
-    let mut ellipses = vec![Ellipse::default(); order.len()];
-    let runs: Vec<Run> = order
-        .par_chunks(RUN)
-        .zip(ellipses.par_chunks_mut(RUN))
-        .enumerate()
-        .map(|(run, (ranks, ellipses))| {
-            level.dispatch(Bucket { splats, first: (run * RUN) as u32, ranks, ellipses, rows, blocks })
-        })
-        .collect();
-    let mut slot_base = Vec::with_capacity(runs.len() * rows);
-    let mut total = vec![0u32; rows];
-    for run in &runs {
-        slot_base.extend_from_slice(&total);
-        (0..rows).for_each(|r| total[r] += run.row_start[r + 1] - run.row_start[r]);
-    }
-    Rows { order, ellipses, runs, slot_base, rows }
-}
-
-impl Rows {
-    /// Number of rows.
-    pub fn len(&self) -> usize {
-        self.rows
-    }
-
-    /// The slots of one row, in depth order.
-    pub fn slots(&self, row: usize) -> Vec<Slot> {
-        let buckets = || self.runs.iter().map(|run| &run.slots[run.row_start[row] as usize..run.row_start[row + 1] as usize]);
-        let mut slots = Vec::with_capacity(buckets().map(<[Slot]>::len).sum());
-        buckets().for_each(|bucket| slots.extend_from_slice(bucket));
-        slots
-    }
-
-    /// Calls `f(rank, its (row, slot) pairs in order of rows)` for every rank of one run.
-    pub fn for_each_rank(&self, run: usize, mut f: impl FnMut(usize, &mut dyn Iterator<Item = (usize, usize)>)) {
-        let (base, run, first) = (&self.slot_base[run * self.rows..], &self.runs[run], run * RUN);
-        let mut at = 0;
-        for (k, &(begin, end)) in run.rows.iter().enumerate() {
-            let places = &run.places[at..at + (end - begin) as usize];
-            at += places.len();
-            let mut slots = (begin..end).zip(places).map(|(row, &place)| (row as usize, (base[row as usize] + place) as usize));
-            f(first + k, &mut slots);
-        }
-    }
-
-    /// Ranks per run; the last may have fewer.
-    pub const RUN: usize = RUN;
-}
-
-/// Order by view-space z, ties by index: a radix sort of the bits of z, which are ordered as z is because z > 0.
-fn depth_order(splats: &[Splat]) -> Vec<u32> {
-    const BITS: u32 = 11;
-    const BUCKETS: usize = 1 << BITS;
-    let mut from: Vec<(u32, u32)> = splats.iter().zip(0..).map(|(s, i)| (s.depth.to_bits(), i)).collect();
-    let mut to = vec![(0u32, 0u32); from.len()];
-    let mut counts = vec![[0u32; 3]; BUCKETS];
-    let digit = |key: u32, pass: u32| (key >> (pass * BITS)) as usize & (BUCKETS - 1);
-    for &(key, _) in &from {
-        (0..3).for_each(|pass| counts[digit(key, pass)][pass as usize] += 1);
-    }
-    let mut next = [0u32; 3];
-    for count in &mut counts {
-        for pass in 0..3 {
-            next[pass] += std::mem::replace(&mut count[pass], next[pass]);
-        }
-    }
-    for pass in 0..3 {
-        // All keys in one bucket: nothing would move.
-        let first = from.first().map_or(0, |&(key, _)| digit(key, pass));
-        let moves = from.iter().any(|&(key, _)| digit(key, pass) != first);
-        if !moves {
-            continue;
-        }
-        for &item in &from {
-            let place = &mut counts[digit(item.0, pass)][pass as usize];
-            to[*place as usize] = item;
-            *place += 1;
-        }
-        std::mem::swap(&mut from, &mut to);
-    }
-    from.into_iter().map(|(_, i)| i).collect()
-}
-
-struct Bucket<'a> {
-    splats: &'a [Splat],
-    /// The first of the ranks.
-    first: u32,
-    /// Rank → splat.
-    ranks: &'a [u32],
-    /// By rank; to be filled.
-    ellipses: &'a mut [Ellipse],
-    rows: usize,
-    blocks: f32,
-}
-
-impl WithSimd for Bucket<'_> {
-    type Output = Run;
-
+impl Run {
+    /// Buckets the splats of one run in an image of so many rows and blocks per band.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> Run {
-        let Bucket { splats, first: first_rank, ranks, ellipses, rows, blocks } = self;
-        let mut run = Run {
-            row_start: vec![0; rows + 1],
-            rows: Vec::with_capacity(ranks.len()),
-            ..Default::default()
-        };
-        // Gathered first, by a loop that does nothing else, so that many cache misses are under way at once.
-        let mut gathered = Vec::with_capacity(ranks.len());
-        for &i in ranks {
-            gathered.push(splats[i as usize]);
-        }
-        let mut by_rank: Vec<Slot> = Vec::with_capacity(4 * ranks.len());
-        for (rank, splat) in gathered.iter().enumerate() {
-            ellipses[rank] = Ellipse::new(splat);
-            let (first, past) = (splat.rows[0] as usize / ROW, (splat.rows[1] as usize).div_ceil(ROW));
+    pub fn new<S: Simd>(s: S, splats: Vec<Splat>, outlines: &[Outline], rows: usize, blocks: usize) -> Self {
+        let mut run = Run { row_start: vec![0; rows + 1], rows: Vec::with_capacity(splats.len()), ..Default::default() };
+        let mut by_splat: Vec<Slot> = Vec::with_capacity(4 * splats.len());
+        for (index, (splat, outline)) in splats.iter().zip(outlines).enumerate() {
+            let (first, past) = (outline.rows[0] as usize / ROW, (outline.rows[1] as usize).div_ceil(ROW));
             run.rows.push((first as u32, past as u32));
             let mut row = first;
             while row < past {
                 let count = (past - row).min(BANDS / ROW_BANDS);
-                let (low, high) = band_spans(s, splat, row * ROW_BANDS, count * ROW_BANDS);
+                let (low, high) = band_spans(s, splat, outline, row * ROW_BANDS, count * ROW_BANDS);
                 for k in 0..count {
-                    let span = |band: usize| block_span(low[ROW_BANDS * k + band], high[ROW_BANDS * k + band], blocks);
-                    by_rank.push(Slot { rank: first_rank + rank as u32, spans: [span(0), span(1)] });
+                    let span = |band: usize| {
+                        block_span(low[ROW_BANDS * k + band], high[ROW_BANDS * k + band], blocks as f32)
+                    };
+                    by_splat.push(Slot { splat: index as u32, spans: [span(0), span(1)] });
                     run.places.push(run.row_start[row + k + 1]);
                     run.row_start[row + k + 1] += 1;
                 }
@@ -188,70 +64,203 @@ impl WithSimd for Bucket<'_> {
         for r in 0..rows {
             run.row_start[r + 1] += run.row_start[r];
         }
-        run.slots = vec![Slot::default(); by_rank.len()];
+        run.slots = vec![Slot::default(); by_splat.len()];
         let mut at = 0;
         for &(first, past) in &run.rows {
             for row in first..past {
-                run.slots[(run.row_start[row as usize] + run.places[at]) as usize] = by_rank[at];
+                run.slots[(run.row_start[row as usize] + run.places[at]) as usize] = by_splat[at];
                 at += 1;
             }
         }
+        run.splats = splats;
         run
+    }
+
+    fn bucket(&self, row: usize) -> &[Slot] {
+        &self.slots[self.row_start[row] as usize..self.row_start[row + 1] as usize]
     }
 }
 
-/// The lists of the blocks of one row.
+/// The runs of a view.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct BlockLists {
-    /// Slot → rank.
-    pub ranks: Vec<u32>,
-    /// Entries of block `b` of band `a` are `start[a][b]..start[a][b + 1]`.
-    pub start: [Vec<u32>; ROW_BANDS],
-    /// Slots, per block in depth order.
-    pub entries: Vec<u32>,
-    /// Per block, how many of its entries matter; later ones find every pixel saturated.
-    pub reach: [Vec<u32>; ROW_BANDS],
+pub(crate) struct Rows {
+    pub runs: Vec<Run>,
+    /// By run: its splats are these of the whole.
+    pub ranges: Vec<Range<usize>>,
+    /// By run, then row: the row's slots before this run.
+    slot_base: Vec<u32>,
+    rows: usize,
 }
 
-impl BlockLists {
-    /// The lists of a row of an image of this many blocks per band.
-    pub fn new(slots: &[Slot], blocks: usize) -> Self {
-        let mut lists = BlockLists { ranks: Vec::with_capacity(slots.len()), ..Default::default() };
-        for slot in slots {
-            lists.ranks.push(slot.rank);
+impl Rows {
+    pub fn new(runs: Vec<Run>, rows: usize) -> Self {
+        let mut slot_base = Vec::with_capacity(runs.len() * rows);
+        let mut ranges = Vec::with_capacity(runs.len());
+        let mut total = vec![0u32; rows];
+        let mut splats = 0;
+        for run in &runs {
+            slot_base.extend_from_slice(&total);
+            (0..rows).for_each(|r| total[r] += run.row_start[r + 1] - run.row_start[r]);
+            ranges.push(splats..splats + run.splats.len());
+            splats += run.splats.len();
         }
+        Rows { runs, ranges, slot_base, rows }
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.rows
+    }
+
+    /// The slots of one row with their splats, in order of Gaussians.
+    #[inline(always)]
+    pub fn for_each_slot(&self, row: usize, mut f: impl FnMut(&Slot, &Splat)) {
+        for run in &self.runs {
+            for slot in run.bucket(row) {
+                f(slot, &run.splats[slot.splat as usize]);
+            }
+        }
+    }
+
+    /// Calls `f(index in the run, row, slot)` for every place of every splat of one run, rows ascending.
+    #[inline(always)]
+    pub fn for_each_place(&self, run: usize, mut f: impl FnMut(usize, usize, usize)) {
+        let (base, run) = (&self.slot_base[run * self.rows..], &self.runs[run]);
+        let mut at = 0;
+        for (index, &(first, past)) in run.rows.iter().enumerate() {
+            for row in first as usize..past as usize {
+                f(index, row, (base[row] + run.places[at]) as usize);
+                at += 1;
+            }
+        }
+    }
+}
+
+/// Buffers of a sort that are used again and again.
+#[derive(Debug, Default)]
+struct Sorter {
+    /// Bits of z, which are ordered as z is because z > 0, and the slot.
+    from: Vec<(u32, u32)>,
+    to: Vec<(u32, u32)>,
+}
+
+impl Sorter {
+    /// Sorts `from` by key; equal keys stay in order. A radix sort: 11 bits at a time, lowest first.
+    fn sort(&mut self) {
+        const BITS: u32 = 11;
+        const BUCKETS: usize = 1 << BITS;
+        let digit = |key: u32, pass: u32| (key >> (pass * BITS)) as usize & (BUCKETS - 1);
+        if self.from.len() < 256 {
+            self.from.sort_unstable();
+            return;
+        }
+        let mut counts = [[0u32; BUCKETS]; 3];
+        for &(key, _) in &self.from {
+            (0..3).for_each(|pass| counts[pass as usize][digit(key, pass)] += 1);
+        }
+        self.to.clear();
+        self.to.resize(self.from.len(), (0, 0));
+        for pass in 0..3 {
+            let next = &mut counts[pass as usize];
+            let first = digit(self.from[0].0, pass);
+            if next[first] as usize == self.from.len() {
+                // All keys have this digit: nothing would move.
+                continue;
+            }
+            let mut sum = 0;
+            next.iter_mut().for_each(|n| sum += std::mem::replace(n, sum));
+            for &item in &self.from {
+                let place = &mut next[digit(item.0, pass)];
+                self.to[*place as usize] = item;
+                *place += 1;
+            }
+            std::mem::swap(&mut self.from, &mut self.to);
+        }
+    }
+}
+
+/// What a thread needs to work on a row; the buffers are used again for the next row.
+#[derive(Debug, Default)]
+pub(crate) struct RowScratch {
+    /// By slot.
+    pub ellipses: Vec<Ellipse>,
+    /// By slot: features, depth, zeros up to the stride.
+    pub features: Vec<f32>,
+    sorter: Sorter,
+    spans: Vec<[(u16, u16); ROW_BANDS]>,
+    change: Vec<u32>,
+    /// Entries of block `b` of band `a` are `start[a][b]..start[a][b + 1]`.
+    start: [Vec<u32>; ROW_BANDS],
+    /// Slots, per block in depth order.
+    entries: Vec<u32>,
+}
+
+impl RowScratch {
+    /// Copies what the row's slots need to know of their splats: a row's worth fits in the cache.
+    #[inline(always)]
+    pub fn gather(&mut self, rows: &Rows, row: usize, features: &crate::Features, stride: usize) {
+        let channels = features.channels;
+        self.ellipses.clear();
+        self.features.clear();
+        rows.for_each_slot(row, |_, splat| self.ellipses.push(Ellipse::new(splat)));
+        self.features.resize(self.ellipses.len() * stride, 0.0);
+        let mut lines = self.features.chunks_exact_mut(stride);
+        rows.for_each_slot(row, |_, splat| {
+            if let Some(line) = lines.next() {
+                line[..channels].copy_from_slice(features.row(splat.gaussian as usize));
+                line[channels] = splat.depth;
+            }
+        });
+    }
+
+    /// Makes the lists of a row of an image of this many blocks per band.
+    #[inline(always)]
+    pub fn list(&mut self, rows: &Rows, row: usize, blocks: usize) {
+        self.spans.clear();
+        self.sorter.from.clear();
+        rows.for_each_slot(row, |slot, splat| {
+            self.sorter.from.push((splat.depth.to_bits(), self.spans.len() as u32));
+            self.spans.push(slot.spans);
+        });
         // Counts as running sums of where spans begin and end.
         let mut total = 0u32;
         for band in 0..ROW_BANDS {
-            let mut change = vec![0u32; blocks + 1];
-            for slot in slots {
-                let (first, past) = slot.spans[band];
-                change[first as usize] = change[first as usize].wrapping_add(1);
-                change[past as usize] = change[past as usize].wrapping_sub(1);
+            self.change.clear();
+            self.change.resize(blocks + 1, 0);
+            for spans in &self.spans {
+                let (first, past) = spans[band];
+                self.change[first as usize] = self.change[first as usize].wrapping_add(1);
+                self.change[past as usize] = self.change[past as usize].wrapping_sub(1);
             }
             let mut covering = 0u32;
-            let mut start = Vec::with_capacity(blocks + 1);
+            let start = &mut self.start[band];
+            start.clear();
             start.push(total);
-            for &change in &change[..blocks] {
+            for &change in &self.change[..blocks] {
                 covering = covering.wrapping_add(change);
                 total += covering;
                 start.push(total);
             }
-            lists.start[band] = start;
-            lists.reach[band] = vec![0; blocks];
         }
-        lists.entries = vec![0; total as usize];
+        self.sorter.sort();
+        self.entries.resize(total as usize, 0);
+        // The second half of each `start` becomes the place of the next entry.
         for band in 0..ROW_BANDS {
-            let mut next = lists.start[band].clone();
-            for (k, slot) in slots.iter().enumerate() {
-                let (first, past) = slot.spans[band];
-                for next in &mut next[first as usize..past as usize] {
-                    lists.entries[*next as usize] = k as u32;
+            self.change.clear();
+            self.change.extend_from_slice(&self.start[band]);
+            for &(_, slot) in &self.sorter.from {
+                let (first, past) = self.spans[slot as usize][band];
+                for next in &mut self.change[first as usize..past as usize] {
+                    self.entries[*next as usize] = slot;
                     *next += 1;
                 }
             }
         }
-        lists
+    }
+
+    /// Number of entries.
+    pub fn entries(&self) -> usize {
+        self.entries.len()
     }
 
     /// The entries of a block.
@@ -262,28 +271,85 @@ impl BlockLists {
     }
 }
 
+/// The entries of a row's blocks that matter: later ones find every pixel saturated. Blocks side by side, each with
+/// its bands.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Reached {
+    /// Slots, per block in depth order.
+    entries: Vec<u32>,
+    /// Per block: how many entries.
+    counts: Vec<u32>,
+}
+
+impl Reached {
+    /// For so many blocks and entries.
+    pub fn with_capacity(blocks: usize, entries: usize) -> Self {
+        Self { entries: Vec::with_capacity(entries), counts: Vec::with_capacity(blocks) }
+    }
+
+    /// Appends the entries of the next block.
+    #[inline(always)]
+    pub fn push(&mut self, entries: &[u32]) {
+        self.entries.extend_from_slice(entries);
+        self.counts.push(entries.len() as u32);
+    }
+
+    /// Gives back what was reserved too much.
+    pub fn shrink(&mut self) {
+        self.entries.shrink_to_fit();
+    }
+
+    /// The blocks' entries in the order in which they were pushed.
+    #[inline(always)]
+    pub fn iter(&self) -> impl Iterator<Item = &[u32]> {
+        let mut at = 0;
+        self.counts.iter().map(move |&count| {
+            let begin = at;
+            at += count as usize;
+            &self.entries[begin..at]
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn depth_order_sorts_and_keeps_ties_by_index() {
+    fn sorting_keeps_ties_by_index() {
         let depths = [3.0f32, 0.5, 1e-30, 3.0, 7e20, 0.5, 0.500_000_06, 1.0];
-        let splats: Vec<Splat> = depths.iter().map(|&depth| Splat { depth, ..Default::default() }).collect();
-        assert_eq!(depth_order(&splats), [2, 1, 5, 6, 7, 0, 3, 4]);
-        assert!(depth_order(&[]).is_empty());
-        let same = vec![Splat { depth: 2.0, ..Default::default() }; 5];
-        assert_eq!(depth_order(&same), [0, 1, 2, 3, 4]);
+        for n in [0, 5, 8, 300, 5000] {
+            let mut sorter = Sorter::default();
+            sorter.from = (0..n).map(|i| (depths[i as usize * 5 % 8].to_bits(), i)).collect();
+            let mut expected = sorter.from.clone();
+            expected.sort();
+            sorter.sort();
+            assert_eq!(sorter.from, expected);
+        }
+        let mut same = Sorter { from: (0..400).map(|i| (7, i)).collect(), ..Default::default() };
+        same.sort();
+        assert!(same.from.iter().map(|v| v.1).eq(0..400));
     }
 
     #[test]
-    fn block_lists_hold_each_span_in_order() {
-        let slot = |rank, a, b| Slot { rank, spans: [a, b] };
-        let slots = [slot(7, (0, 2), (1, 3)), slot(9, (0, 0), (2, 3)), slot(11, (1, 3), (0, 0))];
-        let lists = BlockLists::new(&slots, 3);
-        assert_eq!(lists.ranks, [7, 9, 11]);
-        let of = |band| (0..3).map(|b| lists.of(band, b).to_vec()).collect::<Vec<_>>();
-        assert_eq!(of(0), [vec![0], vec![0, 2], vec![2]]);
+    fn block_lists_hold_each_span_in_depth_order() {
+        let splat = |depth| Splat { depth, ..Default::default() };
+        let slot = |splat, a, b| Slot { splat, spans: [a, b] };
+        let run = Run {
+            splats: vec![splat(2.0), splat(9.0), splat(1.0)],
+            slots: vec![slot(0, (0, 2), (1, 3)), slot(1, (0, 0), (2, 3)), slot(2, (1, 3), (0, 0))],
+            row_start: vec![0, 3],
+            rows: vec![(0, 1); 3],
+            places: vec![0, 1, 2],
+        };
+        let rows = Rows::new(vec![run], 1);
+        let mut scratch = RowScratch::default();
+        scratch.list(&rows, 0, 3);
+        let of = |band| (0..3).map(|b| scratch.of(band, b).to_vec()).collect::<Vec<_>>();
+        assert_eq!(of(0), [vec![0], vec![2, 0], vec![2]]);
         assert_eq!(of(1), [vec![], vec![0], vec![0, 1]]);
+        let mut places = Vec::new();
+        rows.for_each_place(0, |splat, row, slot| places.push((splat, row, slot)));
+        assert_eq!(places, [(0, 0, 0), (1, 0, 1), (2, 0, 2)]);
     }
 }

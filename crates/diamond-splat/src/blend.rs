@@ -3,8 +3,9 @@
 //! Per block of 16 pixels and per batch of splats two phases alternate: first the weights `w = α·T` front to back, then
 //! `Σ w f` for four channels at a time with the sums in registers, which is a small matrix product and as fast as one.
 //! Depth is one more channel (the splat's z); opacity is the sum of the weights.
-use crate::bins::{BlockLists, ROW, ROW_BANDS, Slot};
-use crate::ellipse::{BLOCK, Ellipse, LANES, Prepared};
+use crate::bins::{ROW, ROW_BANDS, Reached, RowScratch, Rows};
+use crate::ellipse::{BLOCK, LANES, Prepared};
+use crate::Features;
 use crate::lanes::{Block, Offsets, Thresholds, alpha, any_positive, composite, load, store, with_lanes};
 use pulp::{Simd, WithSimd};
 
@@ -15,11 +16,10 @@ pub(crate) const GROUP: usize = 4;
 
 /// What every row needs to know.
 pub(crate) struct Scene<'a> {
-    /// By rank.
-    pub ellipses: &'a [Ellipse],
-    /// By rank: the features, the depth, zeros up to the stride.
-    pub features: &'a [f32],
-    /// Of `features`; a multiple of [`GROUP`] and of the vector width.
+    pub rows: &'a Rows,
+    /// By Gaussian.
+    pub features: &'a Features,
+    /// Of a row's own copy of the features; a multiple of [`GROUP`] and of the vector width.
     pub stride: usize,
     /// Without depth.
     pub channels: usize,
@@ -93,7 +93,7 @@ impl Scene<'_> {
 pub(crate) struct RowForward<'a> {
     pub scene: &'a Scene<'a>,
     pub row: usize,
-    pub slots: &'a [Slot],
+    pub scratch: &'a mut RowScratch,
     /// The row's pixels × channels.
     pub features: &'a mut [f32],
     /// The row's pixels.
@@ -105,6 +105,8 @@ pub(crate) struct RowForward<'a> {
 /// How much was done.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RowWork {
+    /// (splat, block) pairs.
+    pub entries: u64,
     /// (splat, pixel) pairs whose alpha was evaluated.
     pub evaluated: u64,
     /// Those with a weight, if they were counted.
@@ -112,10 +114,10 @@ pub(crate) struct RowWork {
 }
 
 impl WithSimd for RowForward<'_> {
-    type Output = (BlockLists, RowWork);
+    type Output = (Reached, RowWork);
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> (BlockLists, RowWork) {
+    fn with_simd<S: Simd>(self, s: S) -> (Reached, RowWork) {
         if self.scene.smooth {
             with_lanes!(s: S, forward_row_smooth(self))
         } else {
@@ -125,19 +127,22 @@ impl WithSimd for RowForward<'_> {
 }
 
 #[inline(always)]
-fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (BlockLists, RowWork) {
+fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (Reached, RowWork) {
     forward_row::<S, N, false>(s, row)
 }
 
 #[inline(always)]
-fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (BlockLists, RowWork) {
+fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (Reached, RowWork) {
     forward_row::<S, N, true>(s, row)
 }
 
 #[inline(always)]
-fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForward) -> (BlockLists, RowWork) {
-    let RowForward { scene, row, slots, features, opacity, depth } = work;
-    let mut lists = BlockLists::new(slots, scene.blocks());
+fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForward) -> (Reached, RowWork) {
+    let RowForward { scene, row, scratch, features, opacity, depth } = work;
+    scratch.gather(scene.rows, row, scene.features, scene.stride);
+    scratch.list(scene.rows, row, scene.blocks());
+    let scratch = &*scratch;
+    let mut lists = Reached::with_capacity(scene.blocks() * ROW_BANDS, scratch.entries());
     let groups = scene.groups();
     let offsets = Offsets::<S, N>::new();
     // Sums by channel.
@@ -147,11 +152,12 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
     let mut batch_rows = [0usize; BATCH];
     let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
-    let mut work = RowWork::default();
-    for band in 0..scene.bands(row) {
-        for block in 0..scene.blocks() {
-            let entries = lists.of(band, block);
-            if entries.is_empty() {
+    let mut work = RowWork { entries: scratch.entries() as u64, ..Default::default() };
+    for block in 0..scene.blocks() {
+        for band in 0..scene.bands(row) {
+            let all = scratch.of(band, block);
+            if all.is_empty() {
+                lists.push(&[]);
                 continue;
             }
             let place = Place { row, band, block };
@@ -160,11 +166,10 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
             let mut sum = [s.splat_f32s(0.0); N];
             acc.fill([0.0; LANES]);
             let mut reach = 0;
-            for (batch, entries) in entries.chunks(BATCH).enumerate() {
+            for (batch, entries) in all.chunks(BATCH).enumerate() {
                 for (k, &slot) in entries.iter().enumerate() {
-                    let rank = lists.ranks[slot as usize] as usize;
-                    batch_rows[k] = rank * scene.stride;
-                    prepared[k] = scene.ellipses[rank].prepare(x, y);
+                    batch_rows[k] = slot as usize * scene.stride;
+                    prepared[k] = scratch.ellipses[slot as usize].prepare(x, y);
                 }
                 work.evaluated += (entries.len() * LANES) as u64;
                 // Phase 1: weights, front to back.
@@ -187,7 +192,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
                     }
                     continue;
                 }
-                reach = (batch * BATCH + last) as u32;
+                reach = batch * BATCH + last;
                 // Phase 2: Σ w f.
                 for group in 0..groups {
                     let acc = &mut acc[group * GROUP..][..GROUP];
@@ -198,7 +203,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
                     for m in 0..n {
                         let w = load::<S, N>(&weights[m]);
                         let at = rows[m] + group * GROUP;
-                        let f = &scene.features[at..at + GROUP];
+                        let f = &scratch.features[at..at + GROUP];
                         for c in 0..GROUP {
                             let f = s.splat_f32s(f[c]);
                             for i in 0..N {
@@ -218,7 +223,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
                     break;
                 }
             }
-            lists.reach[band][block] = reach;
+            lists.push(&all[..reach]);
             if reach == 0 {
                 continue;
             }
@@ -240,5 +245,6 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
             }
         }
     }
+    lists.shrink();
     (lists, work)
 }

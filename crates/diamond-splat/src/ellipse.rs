@@ -4,7 +4,7 @@
 //! pair `(u, v)` at a block's centre is computed in f64, and inside a block it is affine in small exact offsets, so its
 //! error in f32 stays near 1e-7 even on long thin ellipses, where the usual `½(A dx² + C dy²) + B dx dy` loses four
 //! digits by cancellation.
-use crate::projection::Splat;
+use crate::projection::{Outline, Splat};
 use pulp::Simd;
 
 /// Side of a block, pixels. Blocks are what splats are binned to: on a processor, work that no pixel needs costs more
@@ -40,6 +40,7 @@ pub(crate) struct Prepared {
 }
 
 impl Ellipse {
+    #[inline(always)]
     pub fn new(s: &Splat) -> Self {
         let kappa = KAPPA2.sqrt();
         Self { mean: s.mean, chol: s.chol.map(|v| v * kappa), log2_opacity: s.log2_opacity }
@@ -77,16 +78,22 @@ const STEPS: [f32; BANDS] = {
 /// only the first `count` (at most [`BANDS`]) are needed. Exact, between the outer pixel centres of a band; empty
 /// (low > high) where the ellipse does not meet the band. `[eq:ellipse-band]`
 #[inline(always)]
-pub(crate) fn band_spans<S: Simd>(s: S, splat: &Splat, first: usize, count: usize) -> ([f32; BANDS], [f32; BANDS]) {
+pub(crate) fn band_spans<S: Simd>(
+    s: S,
+    splat: &Splat,
+    outline: &Outline,
+    first: usize,
+    count: usize,
+) -> ([f32; BANDS], [f32; BANDS]) {
     let [l11, l21, l22] = splat.chol;
     let [ex, ey] = splat.extent;
     let set = |v: f32| s.splat_f32s(v);
     // The ellipse σ ≤ τ relative to the mean: y of the rightmost point, x of the centre line per unit of y, half the
     // width of a row per unit of √(2τ − w₂²), w₂ = y/√cov_yy.
-    let rightmost = (splat.cov[1] / splat.cov[0]) as f32 * ex;
+    let rightmost = outline.rightmost;
     let (rightmost, leftmost) = (set(rightmost), set(-rightmost));
     let (slope, half_width, inv_sqrt) = (set((-l21 / l11) as f32), set((1.0 / l11) as f32), set(l22 as f32));
-    let (two_tau, zero) = (set(splat.two_tau as f32), set(0.0));
+    let (two_tau, zero) = (set(outline.two_tau), set(0.0));
     let slack = INTERVAL_SLACK.0 + INTERVAL_SLACK.1 * ex;
     let (x_low, x_high) = (set(splat.mean[0] as f32 - slack), set(splat.mean[0] as f32 + slack));
     let top = set(((first * BLOCK) as f64 + 0.5 - splat.mean[1]) as f32);
@@ -130,13 +137,13 @@ mod tests {
     use super::*;
     use crate::lanes::Level;
 
-    struct Band(Splat);
+    struct Band(Splat, Outline);
 
     impl pulp::WithSimd for Band {
         type Output = ([f32; BANDS], [f32; BANDS]);
         #[inline(always)]
         fn with_simd<S: Simd>(self, s: S) -> Self::Output {
-            band_spans(s, &self.0, 0, BANDS)
+            band_spans(s, &self.0, &self.1, 0, BANDS)
         }
     }
 
@@ -150,9 +157,7 @@ mod tests {
             let det: f64 = a * c - b * b;
             let splat = Splat {
                 mean: [64.0 * r(4), 64.0 * r(5)],
-                cov: [a, b, c],
                 chol: [(c / det).sqrt(), -b / (c * det).sqrt(), 1.0 / c.sqrt()],
-                two_tau: 11.0 * r(6),
                 extent: [(11.0 * r(6) * a).sqrt() as f32, (11.0 * r(6) * c).sqrt() as f32],
                 opacity: 0.5,
                 ..Default::default()
@@ -162,12 +167,15 @@ mod tests {
             // Bands begin at multiples of the block: the splat is moved instead of the band.
             let shift = 0.5 - y0;
             let moved = Splat { mean: [splat.mean[0], splat.mean[1] + shift], ..splat };
-            let (low, high) = Level::native().dispatch(Band(moved));
+            let two_tau = 11.0 * r(6);
+            let rightmost = (b / a) as f32 * splat.extent[0];
+            let outline = Outline { two_tau: two_tau as f32, rightmost, rows: [0, 4] };
+            let (low, high) = Level::native().dispatch(Band(moved, outline));
             let (lo, hi) = (low[0], high[0]);
             let (mut seen_lo, mut seen_hi) = (f64::MAX, f64::MIN);
             for k in 0..=3000 {
                 let dy = y0 + (y1 - y0) * k as f64 / 3000.0 - splat.mean[1];
-                let inside = splat.two_tau - dy * dy / c;
+                let inside = two_tau - dy * dy / c;
                 if inside >= 0.0 {
                     let half = (det / c * inside).sqrt();
                     seen_lo = seen_lo.min(splat.mean[0] + b / c * dy - half);

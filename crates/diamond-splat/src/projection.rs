@@ -8,16 +8,21 @@
 //! Everything here is evaluated in f64, once per Gaussian: the inverse of a long thin ellipse loses as many digits as
 //! its condition number has, and 1e-5 of relative error is what gradients are allowed. The determinant is a sum of
 //! squares (Cauchy–Binet), never a difference.
+use crate::bins::{ROW, Rows, Run};
+use crate::ellipse::BLOCK;
 use crate::footprint::{Linearised, View};
+use crate::lanes::Level;
 use crate::{Cutoff, Gaussians, RasterConfig, SplatError};
 use diamond_camera::Camera;
 use glam::{Vec2, Vec3};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Relative slack of the extent, so that f32 rounding in the kernels never meets a block that was culled.
 const EXTENT_SLACK: f64 = 1e-4;
 /// Gaussians per parallel task.
-const CHUNK: usize = 1024;
+pub(crate) const CHUNK: usize = 1024;
 
 /// The screen-space picture of one Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,9 +37,13 @@ pub struct Footprint {
     pub extent: Vec2,
 }
 
-/// One Gaussian that can contribute, with what the kernels need.
+/// One Gaussian that can contribute, with what the kernels need: a cache line.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Splat {
+    /// Projected mean, px.
+    pub mean: [f64; 2],
+    /// Cholesky factor of the conic: `l11, l21, l22`.
+    pub chol: [f64; 3],
     /// Index of the Gaussian.
     pub gaussian: u32,
     /// View-space z.
@@ -43,16 +52,17 @@ pub(crate) struct Splat {
     pub opacity: f32,
     /// Its logarithm to base 2.
     pub log2_opacity: f32,
-    /// Projected mean, px.
-    pub mean: [f64; 2],
-    /// Screen covariance with low-pass: xx, xy, yy.
-    pub cov: [f64; 3],
-    /// Cholesky factor of the conic: `l11, l21, l22`.
-    pub chol: [f64; 3],
-    /// Twice the largest σ at which alpha still counts, with slack.
-    pub two_tau: f64,
     /// Half extents of the ellipse σ ≤ τ, px.
     pub extent: [f32; 2],
+}
+
+/// What else finding the blocks of a splat takes.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Outline {
+    /// Twice the largest σ at which alpha still counts, with slack.
+    pub two_tau: f32,
+    /// y of the rightmost point from the mean, px.
+    pub rightmost: f32,
     /// Rows of pixels (first, one past last) whose centres it can touch.
     pub rows: [u32; 2],
 }
@@ -68,7 +78,7 @@ fn pixel_range(mean: f64, extent: f64, size: u32) -> (u32, u32) {
 pub struct Projection {
     pub(crate) camera: Camera,
     pub(crate) config: RasterConfig,
-    pub(crate) splats: Vec<Splat>,
+    pub(crate) rows: Rows,
     visible: Vec<u32>,
     radii: Vec<f32>,
 }
@@ -98,7 +108,8 @@ impl Projection {
     /// The footprint of a Gaussian, `None` where it is culled.
     pub fn footprint(&self, gaussian: usize) -> Option<Footprint> {
         let k = self.visible.binary_search(&u32::try_from(gaussian).ok()?).ok()?;
-        let s = &self.splats[k];
+        let run = self.rows.ranges.partition_point(|range| range.end <= k);
+        let s = &self.rows.runs[run].splats[k - self.rows.ranges[run].start];
         let [l11, l21, l22] = s.chol;
         Some(Footprint {
             mean: Vec2::new(s.mean[0] as f32, s.mean[1] as f32),
@@ -130,26 +141,52 @@ pub fn project(gaussians: &Gaussians, camera: &Camera, config: &RasterConfig) ->
         });
     }
     let view = View::new(camera);
-    let chunks: Vec<Vec<Splat>> = (0..n.div_ceil(CHUNK))
+    let level = Level::native();
+    let runs: Vec<Run> = (0..n.div_ceil(CHUNK))
         .into_par_iter()
         .map(|chunk| {
             let range = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
-            let mut splats = Vec::with_capacity(range.len());
-            splats.extend(range.filter_map(|i| project_one(gaussians, i, &view, config)));
-            splats
+            level.dispatch(ProjectRun { gaussians, range, view: &view, config })
         })
         .collect();
-    let mut splats = Vec::with_capacity(chunks.iter().map(Vec::len).sum());
-    chunks.iter().for_each(|c| splats.extend_from_slice(c));
     let mut radii = vec![0.0; n];
-    for s in &splats {
+    let mut visible = Vec::with_capacity(runs.iter().map(|run| run.splats.len()).sum());
+    for s in runs.iter().flat_map(|run| &run.splats) {
         radii[s.gaussian as usize] = s.extent[0].max(s.extent[1]);
+        visible.push(s.gaussian);
     }
-    let visible = splats.iter().map(|s| s.gaussian).collect();
-    Ok(Projection { camera: *camera, config: *config, splats, visible, radii })
+    let rows = Rows::new(runs, (view.size[1] as usize).div_ceil(ROW));
+    Ok(Projection { camera: *camera, config: *config, rows, visible, radii })
 }
 
-/// Entries of tile lists hold 28 bits of index.
+/// The projection of consecutive Gaussians.
+struct ProjectRun<'a> {
+    gaussians: &'a Gaussians,
+    range: Range<usize>,
+    view: &'a View,
+    config: &'a RasterConfig,
+}
+
+impl WithSimd for ProjectRun<'_> {
+    type Output = Run;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> Run {
+        let ProjectRun { gaussians, range, view, config } = self;
+        let mut splats = Vec::with_capacity(range.len());
+        let mut outlines = Vec::with_capacity(range.len());
+        for i in range {
+            if let Some((splat, outline)) = project_one(gaussians, i, view, config) {
+                splats.push(splat);
+                outlines.push(outline);
+            }
+        }
+        let [width, height] = view.size.map(|side| side as usize);
+        Run::new(s, splats, &outlines, height.div_ceil(ROW), width.div_ceil(BLOCK))
+    }
+}
+
+/// Indices are 32 bits, with room for sentinels.
 const MAX_GAUSSIANS: usize = 1 << 28;
 /// Largest side of an image, pixels.
 const MAX_SIDE: u32 = 1 << 15;
@@ -179,7 +216,7 @@ fn validate_camera(camera: &Camera) -> Result<(), SplatError> {
 }
 
 /// One Gaussian's splat, `None` where it is culled.
-fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> Option<Splat> {
+fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> Option<(Splat, Outline)> {
     let opacity = g.opacities[i];
     if opacity < config.min_alpha || opacity <= 0.0 {
         return None;
@@ -206,18 +243,17 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
     let finite = within(&mean, MAX_MEAN) && within(&cov, MAX_COVARIANCE) && within(&chol, MAX_MEAN) && det.is_finite();
     let (x0, x1) = pixel_range(mean[0], ex, view.size[0]);
     let (y0, y1) = pixel_range(mean[1], ey, view.size[1]);
-    (finite && x0 < x1 && y0 < y1).then_some(Splat {
+    let splat = Splat {
+        mean,
+        chol,
         gaussian: i as u32,
         depth: z as f32,
         opacity,
         log2_opacity: log2_opacity as f32,
-        mean,
-        cov,
-        chol,
-        two_tau,
         extent: [ex as f32, ey as f32],
-        rows: [y0, y1],
-    })
+    };
+    let outline = Outline { two_tau: two_tau as f32, rightmost: (cov[1] / cov[0] * ex) as f32, rows: [y0, y1] };
+    (finite && x0 < x1 && y0 < y1).then_some((splat, outline))
 }
 
 /// Screen means beyond this (px) and covariances beyond this (px²) are culled: their f32 copies would overflow when

@@ -8,7 +8,7 @@
 //! the 16 pixels are matrix products with a row per pixel, so no horizontal additions are needed; the geometric
 //! gradient is carried by the six moments `Σ g·(1, x, y, x², xy, y²)` about the block's centre, which are turned into
 //! moments of the whitened offset `Lᵀd` before they are added up: there a long thin splat's do not cancel.
-use crate::bins::BlockLists;
+use crate::bins::{Reached, RowScratch};
 use crate::blend::{Place, Scene};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{OFFSETS, Offsets, alpha, composite, load, store, with_lanes};
@@ -49,7 +49,8 @@ fn whiten(at: &[Prepared; GROUP], m: &[[f32; GEOMETRY]; GROUP]) -> [[f32; GEOMET
 pub(crate) struct RowBackward<'a> {
     pub scene: &'a Scene<'a>,
     pub row: usize,
-    pub lists: &'a BlockLists,
+    pub lists: &'a Reached,
+    pub scratch: &'a mut RowScratch,
     /// Cotangents of the row's pixels.
     pub d_features: &'a [f32],
     pub d_opacity: &'a [f32],
@@ -92,10 +93,13 @@ const EMPTY: Pair = Pair { alpha: [0.0; LANES], transmittance: [0.0; LANES], cha
 
 #[inline(always)]
 fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackward) -> Vec<f32> {
-    let RowBackward { scene, row, lists, d_features, d_opacity, d_depth } = row;
+    let RowBackward { scene, row, lists, scratch, d_features, d_opacity, d_depth } = row;
     let (stride, channels) = (scene.stride, scene.channels);
     let line = GEOMETRY + stride;
-    let mut grad = vec![0.0f32; lists.ranks.len() * line];
+    scratch.gather(scene.rows, row, scene.features, stride);
+    let scratch = &*scratch;
+    let mut grad = vec![0.0f32; scratch.ellipses.len() * line];
+    let mut lists = lists.iter();
     let offsets = Offsets::<S, N>::new();
     let basis = moment_basis();
     let zero = s.splat_f32s(0.0);
@@ -105,18 +109,18 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     // Cotangents of a block: a row per channel, and a row per pixel.
     let mut by_channel = vec![[0.0f32; LANES]; channels + 1];
     let mut by_pixel = vec![0.0f32; LANES * stride];
-    for band in 0..scene.bands(row) {
-        for block in 0..scene.blocks() {
-            let reach = lists.reach[band][block] as usize;
+    for block in 0..scene.blocks() {
+        for band in 0..scene.bands(row) {
+            let entries = lists.next().unwrap_or(&[]);
+            let reach = entries.len();
             if reach == 0 {
                 continue;
             }
             let place = Place { row, band, block };
-            let entries = &lists.of(band, block)[..reach];
             let centre = scene.centre(place);
             prepared.clear();
             for &slot in entries {
-                prepared.push(scene.ellipses[lists.ranks[slot as usize] as usize].prepare(centre.0, centre.1));
+                prepared.push(scratch.ellipses[slot as usize].prepare(centre.0, centre.1));
             }
             let (width, height) = scene.size(place);
             let mut d_one = [0.0f32; LANES];
@@ -175,14 +179,14 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 for m in 0..GROUP {
                     let source = sources[(begin + m).min(end - 1)] as usize;
                     slots[m] = entries[source] as usize;
-                    rows[m] = lists.ranks[slots[m]] as usize * stride;
+                    rows[m] = slots[m] * stride;
                     at[m] = prepared[source];
                 }
                 let mut e = [d_one; GROUP];
                 for c in 0..=channels {
                     let d = load::<S, N>(&by_channel[c]);
                     for m in 0..GROUP {
-                        let f = s.splat_f32s(scene.features[rows[m] + c]);
+                        let f = s.splat_f32s(scratch.features[rows[m] + c]);
                         for i in 0..N {
                             e[m][i] = s.mul_add_e_f32s(f, d[i], e[m][i]);
                         }

@@ -1,10 +1,10 @@
 //! The rasteriser's front: `rasterize`, what it returns, and the pullback that belongs to it.
-use crate::bins::{BlockLists, ROW, Rows, assign_rows};
+use crate::bins::{ROW, Reached, RowScratch};
 use crate::blend::{RowForward, RowWork, Scene};
 use crate::ellipse::KAPPA2;
 use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::{Level, Thresholds};
-use crate::projection::{is_smooth, project};
+use crate::projection::{CHUNK, is_smooth, project};
 use crate::pullback::{GEOMETRY, RowBackward};
 use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
@@ -12,9 +12,7 @@ use diamond_image::Image;
 use glam::Vec2;
 use rayon::prelude::*;
 use std::borrow::Cow;
-
-/// Gaussians whose gradient is one parallel task.
-const PIECE: usize = 512;
+use std::cell::RefCell;
 
 /// What a view of the Gaussians looks like. Weights are `w_k = α_k Π_{j<k} (1 − α_j)`, nearest first.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,10 +69,7 @@ pub struct RasterPullback<'a> {
     gaussians: &'a Gaussians,
     projection: Cow<'a, Projection>,
     features: &'a Features,
-    rows: Rows,
-    /// By rank: features, depth, zeros up to the stride.
-    ranked: Vec<f32>,
-    lists: Vec<BlockLists>,
+    lists: Vec<Reached>,
     /// The instruction set of the forward pass: the reverse must see the same bits.
     level: Level,
 }
@@ -152,55 +147,55 @@ fn blend<'a>(
     if let Some(&i) = projection.visible().iter().find(|&&i| !features.row(i as usize).iter().all(|v| v.is_finite())) {
         return Err(SplatError::NonFinite { what: "Features::data (row of Gaussian)", index: i as usize });
     }
-    let rows = assign_rows(&projection, level);
-    let stride = stride(channels, level);
-    let ranked = ranked_features(&projection, &rows.order, features, stride);
     let k = &projection.camera.intrinsics;
     let (width, height) = (k.width as usize, k.height as usize);
     let mut raster = Raster {
         features: Image::new(width, height, channels),
         opacity: Image::new(width, height, 1),
         depth: Image::new(width, height, 1),
-        stats: RasterStats { visible: rows.order.len(), ..Default::default() },
+        stats: RasterStats { visible: projection.visible().len(), ..Default::default() },
     };
-    let scene = scene(&projection, &rows, &ranked, channels, level);
+    let scene = scene(&projection, features, level);
     let band = width * ROW;
     // Zero channels: every row gets an empty piece.
     let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
-        (0..rows.len()).map(|_| Default::default()).collect()
+        (0..projection.rows.len()).map(|_| Default::default()).collect()
     } else {
         raster.features.data_mut().chunks_mut(band * channels).collect()
     };
-    let (lists, works): (Vec<BlockLists>, Vec<RowWork>) = feature_rows
+    let (lists, works): (Vec<Reached>, Vec<RowWork>) = feature_rows
         .par_iter_mut()
         .zip(raster.opacity.data_mut().par_chunks_mut(band))
         .zip(raster.depth.data_mut().par_chunks_mut(band))
         .enumerate()
         .map(|(row, ((features, opacity), depth))| {
-            let slots = &rows.slots(row);
-            level.dispatch(RowForward { scene: &scene, row, slots, features, opacity, depth })
+            with_scratch(|scratch| {
+                level.dispatch(RowForward { scene: &scene, row, scratch, features, opacity, depth })
+            })
         })
         .unzip();
-    raster.stats.block_entries = lists.iter().map(|l| l.entries.len() as u64).sum();
+    raster.stats.block_entries = works.iter().map(|w| w.entries).sum();
     raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
     raster.stats.blended_pairs = projection.config.count_blended.then(|| works.iter().map(|w| w.blended).sum());
-    Ok((raster, RasterPullback { gaussians, features, projection, rows, ranked, lists, level }))
+    Ok((raster, RasterPullback { gaussians, features, projection, lists, level }))
 }
 
-fn scene<'a>(
-    projection: &Projection,
-    rows: &'a Rows,
-    ranked: &'a [f32],
-    channels: usize,
-    level: Level,
-) -> Scene<'a> {
+/// Runs `f` with the buffers of this thread.
+fn with_scratch<T>(f: impl FnOnce(&mut RowScratch) -> T) -> T {
+    thread_local! {
+        static SCRATCH: RefCell<RowScratch> = RefCell::default();
+    }
+    SCRATCH.with_borrow_mut(f)
+}
+
+fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
-        ellipses: &rows.ellipses,
-        features: ranked,
-        stride: stride(channels, level),
-        channels,
+        rows: &projection.rows,
+        features,
+        stride: stride(features.channels, level),
+        channels: features.channels,
         limits: Thresholds {
             min_alpha: config.min_alpha,
             max_alpha: config.max_alpha,
@@ -213,23 +208,9 @@ fn scene<'a>(
     }
 }
 
-/// Values per splat in [`ranked_features`].
+/// Values per splat in a row's copy of the features.
 fn stride(channels: usize, level: Level) -> usize {
     (channels + 1).next_multiple_of(level.width().max(GEOMETRY))
-}
-
-/// The features of the visible Gaussians in depth order, each followed by its depth and zeros up to the stride: what
-/// blocks read next lies close by.
-fn ranked_features(projection: &Projection, order: &[u32], features: &Features, stride: usize) -> Vec<f32> {
-    let mut ranked = vec![0.0f32; order.len() * stride];
-    ranked.par_chunks_mut(stride * PIECE).zip(order.par_chunks(PIECE)).for_each(|(lines, order)| {
-        for (line, &i) in lines.chunks_exact_mut(stride).zip(order) {
-            let splat = &projection.splats[i as usize];
-            line[..features.channels].copy_from_slice(features.row(splat.gaussian as usize));
-            line[features.channels] = splat.depth;
-        }
-    });
-    ranked
 }
 
 impl RasterPullback<'_> {
@@ -249,20 +230,23 @@ impl RasterPullback<'_> {
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
         let channels = self.features.channels;
-        let scene = scene(&self.projection, &self.rows, &self.ranked, channels, self.level);
+        let scene = scene(&self.projection, self.features, self.level);
         let parts: Vec<Vec<f32>> = self
             .lists
             .par_iter()
             .enumerate()
             .map(|(row, lists)| {
                 let pixels = row * ROW * width..height.min((row + 1) * ROW) * width;
-                self.level.dispatch(RowBackward {
-                    scene: &scene,
-                    row,
-                    lists,
-                    d_features: &d.features.data()[pixels.start * channels..pixels.end * channels],
-                    d_opacity: &d.opacity.data()[pixels.clone()],
-                    d_depth: &d.depth.data()[pixels],
+                with_scratch(|scratch| {
+                    self.level.dispatch(RowBackward {
+                        scene: &scene,
+                        row,
+                        lists,
+                        scratch,
+                        d_features: &d.features.data()[pixels.start * channels..pixels.end * channels],
+                        d_opacity: &d.opacity.data()[pixels.clone()],
+                        d_depth: &d.depth.data()[pixels],
+                    })
                 })
             })
             .collect();
@@ -274,49 +258,34 @@ impl RasterPullback<'_> {
         let n = self.gaussians.len();
         let channels = self.features.channels;
         let line = GEOMETRY + stride(channels, self.level);
-        let splats = &self.projection.splats;
-        // By rank first: consecutive ranks read consecutive slots of every row.
-        let mut sums = vec![0.0f32; splats.len() * line];
-        sums.par_chunks_mut(line * Rows::RUN).enumerate().for_each(|(run, sums)| {
-            self.rows.for_each_rank(run, |rank, slots| {
-                let to = &mut sums[(rank - run * Rows::RUN) * line..][..line];
-                for (row, slot) in slots {
-                    let from = &parts[row][slot * line..][..line];
-                    to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
-                }
-            });
-        });
-        // Then by Gaussian, in pieces of the ascending list of splats.
-        let mut rank_of = vec![0u32; splats.len()];
-        for (rank, &i) in self.rows.order.iter().enumerate() {
-            rank_of[i as usize] = rank as u32;
-        }
+        let rows = &self.projection.rows;
         let view = View::new(&self.projection.camera);
         let mut g = GaussiansGrad::zeros(n);
         let mut screen = vec![Vec2::ZERO; n];
         let mut d_features = vec![0.0; n * channels];
-        let mut feature_pieces: Vec<&mut [f32]> = d_features.chunks_mut((PIECE * channels).max(1)).collect();
-        feature_pieces.resize_with(n.div_ceil(PIECE), Default::default);
+        let mut feature_pieces: Vec<&mut [f32]> = d_features.chunks_mut((CHUNK * channels).max(1)).collect();
+        feature_pieces.resize_with(n.div_ceil(CHUNK), Default::default);
         (
-            g.means.par_chunks_mut(PIECE),
-            g.scales.par_chunks_mut(PIECE),
-            g.rotations.par_chunks_mut(PIECE),
-            g.opacities.par_chunks_mut(PIECE),
-            screen.par_chunks_mut(PIECE),
+            g.means.par_chunks_mut(CHUNK),
+            g.scales.par_chunks_mut(CHUNK),
+            g.rotations.par_chunks_mut(CHUNK),
+            g.opacities.par_chunks_mut(CHUNK),
+            screen.par_chunks_mut(CHUNK),
             feature_pieces,
         )
             .into_par_iter()
             .enumerate()
-            .for_each(|(piece, (means, scales, rotations, opacities, screen, d_features))| {
-                let first = piece * PIECE;
-                let begin = splats.partition_point(|s| (s.gaussian as usize) < first);
-                for (splat, &rank) in splats[begin..].iter().zip(&rank_of[begin..]) {
-                    let (gaussian, rank) = (splat.gaussian as usize, rank as usize);
-                    let i = gaussian - first;
-                    if i >= PIECE {
-                        break;
-                    }
-                    let (moments, features) = sums[rank * line..][..line].split_at(GEOMETRY);
+            .for_each(|(run, (means, scales, rotations, opacities, screen, d_features))| {
+                let splats = &rows.runs[run].splats;
+                let mut sums = vec![0.0f32; splats.len() * line];
+                rows.for_each_place(run, |splat, row, slot| {
+                    let from = &parts[row][slot * line..][..line];
+                    sums[splat * line..][..line].iter_mut().zip(from).for_each(|(a, b)| *a += b);
+                });
+                for (splat, sums) in splats.iter().zip(sums.chunks_exact(line)) {
+                    let gaussian = splat.gaussian as usize;
+                    let i = gaussian - run * CHUNK;
+                    let (moments, features) = sums.split_at(GEOMETRY);
                     let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
                     let d = project_pull(self.gaussians, gaussian, &view, &footprint);
                     (means[i], scales[i], rotations[i]) = (d.mean, d.scale, d.rotation);
