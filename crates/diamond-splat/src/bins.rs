@@ -186,6 +186,7 @@ pub(crate) struct RowScratch {
     pub ellipses: Vec<Ellipse>,
     /// By slot: features, depth, zeros up to the stride.
     pub features: Vec<f32>,
+    gaussians: Vec<u32>,
     sorter: Sorter,
     spans: Vec<[(u16, u16); ROW_BANDS]>,
     change: Vec<u32>,
@@ -201,50 +202,56 @@ impl RowScratch {
     pub fn gather(&mut self, rows: &Rows, row: usize, features: &crate::Features, stride: usize) {
         let channels = features.channels;
         self.ellipses.clear();
-        self.features.clear();
-        rows.for_each_slot(row, |_, splat| self.ellipses.push(Ellipse::new(splat)));
-        self.features.resize(self.ellipses.len() * stride, 0.0);
-        let mut lines = self.features.chunks_exact_mut(stride);
-        rows.for_each_slot(row, |_, splat| {
-            if let Some(line) = lines.next() {
-                line[..channels].copy_from_slice(features.row(splat.gaussian as usize));
-                line[channels] = splat.depth;
-            }
-        });
-    }
-
-    /// Makes the lists of a row of an image of this many blocks per band.
-    #[inline(always)]
-    pub fn list(&mut self, rows: &Rows, row: usize, blocks: usize) {
-        self.spans.clear();
         self.sorter.from.clear();
+        self.spans.clear();
+        self.gaussians.clear();
         rows.for_each_slot(row, |slot, splat| {
             self.sorter.from.push((splat.depth.to_bits(), self.spans.len() as u32));
             self.spans.push(slot.spans);
+            self.ellipses.push(Ellipse::new(splat));
+            self.gaussians.push(splat.gaussian);
         });
+        self.features.clear();
+        self.features.resize(self.ellipses.len() * stride, 0.0);
+        let lines = self.features.chunks_exact_mut(stride);
+        for ((line, &gaussian), &(depth, _)) in lines.zip(&self.gaussians).zip(&self.sorter.from) {
+            // A loop of its own: rows are short, and a call for each costs more than the copy.
+            for (to, from) in line.iter_mut().zip(features.row(gaussian as usize)) {
+                *to = *from;
+            }
+            line[channels] = f32::from_bits(depth);
+        }
+    }
+
+    /// Makes the lists of the row that was gathered, of an image of this many blocks per band.
+    #[inline(always)]
+    pub fn list(&mut self, blocks: usize) {
         // Counts as running sums of where spans begin and end.
+        let size = blocks + 1;
+        self.change.clear();
+        self.change.resize(2 * ROW_BANDS * size, 0);
+        let (begins, ends) = self.change.split_at_mut(ROW_BANDS * size);
+        for spans in &self.spans {
+            for band in 0..ROW_BANDS {
+                let (first, past) = spans[band];
+                begins[band * size + first as usize] += 1;
+                ends[band * size + past as usize] += 1;
+            }
+        }
         let mut total = 0u32;
         for band in 0..ROW_BANDS {
-            self.change.clear();
-            self.change.resize(blocks + 1, 0);
-            for spans in &self.spans {
-                let (first, past) = spans[band];
-                self.change[first as usize] = self.change[first as usize].wrapping_add(1);
-                self.change[past as usize] = self.change[past as usize].wrapping_sub(1);
-            }
             let mut covering = 0u32;
             let start = &mut self.start[band];
             start.clear();
             start.push(total);
-            for &change in &self.change[..blocks] {
-                covering = covering.wrapping_add(change);
+            for block in 0..blocks {
+                covering = covering + begins[band * size + block] - ends[band * size + block];
                 total += covering;
                 start.push(total);
             }
         }
         self.sorter.sort();
         self.entries.resize(total as usize, 0);
-        // The second half of each `start` becomes the place of the next entry.
         for band in 0..ROW_BANDS {
             self.change.clear();
             self.change.extend_from_slice(&self.start[band]);
@@ -344,7 +351,9 @@ mod tests {
         };
         let rows = Rows::new(vec![run], 1);
         let mut scratch = RowScratch::default();
-        scratch.list(&rows, 0, 3);
+        let features = crate::Features { channels: 0, data: Vec::new() };
+        scratch.gather(&rows, 0, &features, 8);
+        scratch.list(3);
         let of = |band| (0..3).map(|b| scratch.of(band, b).to_vec()).collect::<Vec<_>>();
         assert_eq!(of(0), [vec![0], vec![2, 0], vec![2]]);
         assert_eq!(of(1), [vec![], vec![0], vec![0, 1]]);

@@ -6,11 +6,13 @@
 use crate::bins::{ROW, ROW_BANDS, Reached, RowScratch, Rows};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::Features;
-use crate::lanes::{Block, Offsets, Thresholds, alpha, any_positive, composite, load, store, with_lanes};
+use crate::lanes::{Block, Limits, Offsets, Thresholds, alphas, any_positive, composite, load, store, with_lanes};
 use pulp::{Simd, WithSimd};
 
 /// Entries of a block that are prepared and blended together.
 const BATCH: usize = 32;
+/// Splats whose alphas are evaluated together.
+pub(crate) const TOGETHER: usize = 2;
 /// Channels that are accumulated together.
 pub(crate) const GROUP: usize = 4;
 
@@ -140,16 +142,16 @@ fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (Reache
 fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForward) -> (Reached, RowWork) {
     let RowForward { scene, row, scratch, features, opacity, depth } = work;
     scratch.gather(scene.rows, row, scene.features, scene.stride);
-    scratch.list(scene.rows, row, scene.blocks());
+    scratch.list(scene.blocks());
     let scratch = &*scratch;
     let mut lists = Reached::with_capacity(scene.blocks() * ROW_BANDS, scratch.entries());
     let groups = scene.groups();
+    let limits = Limits::new(s, &scene.limits);
     let offsets = Offsets::<S, N>::new();
     // Sums by channel.
     let mut acc = vec![[0.0f32; LANES]; groups * GROUP];
     let mut prepared = [Prepared::default(); BATCH];
-    // Where a splat's features begin: of the batch, and of those with a weight.
-    let mut batch_rows = [0usize; BATCH];
+    // Where a splat's features begin.
     let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
     let mut work = RowWork { entries: scratch.entries() as u64, ..Default::default() };
@@ -168,41 +170,39 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
             let mut reach = 0;
             for (batch, entries) in all.chunks(BATCH).enumerate() {
                 for (k, &slot) in entries.iter().enumerate() {
-                    batch_rows[k] = slot as usize * scene.stride;
+                    rows[k] = slot as usize * scene.stride;
                     prepared[k] = scratch.ellipses[slot as usize].prepare(x, y);
                 }
-                work.evaluated += (entries.len() * LANES) as u64;
+                let n = entries.len();
+                work.evaluated += (n * LANES) as u64;
+                if let Some(beyond) = prepared.get_mut(n) {
+                    *beyond = Prepared::NOTHING;
+                }
                 // Phase 1: weights, front to back.
-                let mut n = 0;
-                let mut last = 0;
-                for k in 0..entries.len() {
-                    let (a, _) = alpha::<S, N, SMOOTH>(s, &prepared[k], &offsets, &scene.limits);
-                    let (w, any) = composite::<S, N>(s, &a, &mut t, &scene.limits);
+                let pairs = prepared.as_chunks::<TOGETHER>().0.iter().zip(weights.as_chunks_mut::<TOGETHER>().0);
+                for (splats, weights) in pairs.take(n.div_ceil(TOGETHER)) {
+                    let (a, _) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
+                    for m in 0..TOGETHER {
+                        let w = composite::<S, N>(s, &a[m], &mut t, &limits);
+                        store::<S, N>(&mut weights[m], w);
+                    }
+                }
+                // Phase 2: Σ w and Σ w f.
+                for m in 0..n {
+                    let w = load::<S, N>(&weights[m]);
                     for i in 0..N {
                         sum[i] = s.add_f32s(sum[i], w[i]);
                     }
-                    store::<S, N>(&mut weights[n], w);
-                    rows[n] = batch_rows[k];
-                    n += any as usize;
-                    last = if any { k + 1 } else { last };
                 }
-                if n == 0 {
-                    if !any_positive::<S, N>(s, &t) {
-                        break;
-                    }
-                    continue;
-                }
-                reach = batch * BATCH + last;
-                // Phase 2: Σ w f.
                 for group in 0..groups {
                     let acc = &mut acc[group * GROUP..][..GROUP];
-                    let mut sums: [Block<S, N>; GROUP] = [[s.splat_f32s(0.0); N]; GROUP];
+                    let mut sums: [Block<S, N>; GROUP] = [[limits.zero; N]; GROUP];
                     for c in 0..GROUP {
                         sums[c] = load::<S, N>(&acc[c]);
                     }
-                    for m in 0..n {
-                        let w = load::<S, N>(&weights[m]);
-                        let at = rows[m] + group * GROUP;
+                    for (w, row) in weights[..n].iter().zip(&rows) {
+                        let w = load::<S, N>(w);
+                        let at = row + group * GROUP;
                         let f = &scratch.features[at..at + GROUP];
                         for c in 0..GROUP {
                             let f = s.splat_f32s(f[c]);
@@ -219,7 +219,12 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
                     let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
                     work.blended += weights[..n].iter().map(positive).sum::<u64>();
                 }
+                reach = batch * BATCH + n;
                 if !any_positive::<S, N>(s, &t) {
+                    // The last that any pixel saw.
+                    while n > 0 && weights[reach - batch * BATCH - 1] == [0.0; LANES] && reach > batch * BATCH + 1 {
+                        reach -= 1;
+                    }
                     break;
                 }
             }

@@ -39,6 +39,12 @@ pub(crate) struct Prepared {
     pub log2_opacity: f32,
 }
 
+impl Prepared {
+    /// A splat that is nowhere to be seen.
+    pub const NOTHING: Prepared =
+        Prepared { u: 0.0, v: 0.0, u_x: 0.0, u_y: 0.0, v_y: 0.0, log2_opacity: f32::NEG_INFINITY };
+}
+
 impl Ellipse {
     #[inline(always)]
     pub fn new(s: &Splat) -> Self {

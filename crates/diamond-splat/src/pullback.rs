@@ -9,9 +9,9 @@
 //! gradient is carried by the six moments `Σ g·(1, x, y, x², xy, y²)` about the block's centre, which are turned into
 //! moments of the whitened offset `Lᵀd` before they are added up: there a long thin splat's do not cancel.
 use crate::bins::{Reached, RowScratch};
-use crate::blend::{Place, Scene};
+use crate::blend::{Place, Scene, TOGETHER};
 use crate::ellipse::{BLOCK, LANES, Prepared};
-use crate::lanes::{OFFSETS, Offsets, alpha, composite, load, store, with_lanes};
+use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite, load, store, with_lanes};
 use pulp::{Simd, WithSimd};
 
 /// Splats that go through the matrix products together.
@@ -102,10 +102,10 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     let mut lists = lists.iter();
     let offsets = Offsets::<S, N>::new();
     let basis = moment_basis();
-    let zero = s.splat_f32s(0.0);
+    let limits = Limits::new(s, &scene.limits);
+    let zero = limits.zero;
     let mut prepared: Vec<Prepared> = Vec::new();
     let mut pairs: Vec<Pair> = Vec::new();
-    let mut sources: Vec<u32> = Vec::new();
     // Cotangents of a block: a row per channel, and a row per pixel.
     let mut by_channel = vec![[0.0f32; LANES]; channels + 1];
     let mut by_pixel = vec![0.0f32; LANES * stride];
@@ -143,28 +143,28 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
             }
             // Front to back: the weights again.
             let mut t = load::<S, N>(&scene.initial_transmittance(place));
-            let mut n = 0;
-            if pairs.len() < reach {
-                pairs.resize(reach, EMPTY);
-                sources.resize(reach, 0);
+            let n = reach;
+            prepared.resize(n.next_multiple_of(TOGETHER), Prepared::NOTHING);
+            if pairs.len() < prepared.len() {
+                pairs.resize(prepared.len(), EMPTY);
             }
-            for k in 0..reach {
-                let before = t;
-                let (mut a, chain) = alpha::<S, N, SMOOTH>(s, &prepared[k], &offsets, &scene.limits);
-                let (w, any) = composite::<S, N>(s, &a, &mut t, &scene.limits);
-                // Lanes that have stopped carry α = T = 0 from here on, so that all their products vanish.
-                let mut t_before = before;
-                for i in 0..N {
-                    let counts = s.greater_than_f32s(w[i], zero);
-                    a[i] = s.select_f32s(counts, a[i], zero);
-                    t_before[i] = s.select_f32s(counts, before[i], zero);
+            let groups = prepared.as_chunks::<TOGETHER>().0.iter().zip(pairs.as_chunks_mut::<TOGETHER>().0);
+            for (splats, pairs) in groups {
+                let (a, chains) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
+                for m in 0..TOGETHER {
+                    let before = t;
+                    let w = composite::<S, N>(s, &a[m], &mut t, &limits);
+                    // Lanes that have stopped carry α = T = 0 from here on, so that all their products vanish.
+                    let (mut a, mut t_before) = (a[m], before);
+                    for i in 0..N {
+                        let counts = s.greater_than_f32s(w[i], zero);
+                        a[i] = s.select_f32s(counts, a[i], zero);
+                        t_before[i] = s.select_f32s(counts, before[i], zero);
+                    }
+                    store::<S, N>(&mut pairs[m].alpha, a);
+                    store::<S, N>(&mut pairs[m].transmittance, t_before);
+                    store::<S, N>(&mut pairs[m].chain, chains[m]);
                 }
-                let pair = &mut pairs[n];
-                store::<S, N>(&mut pair.alpha, a);
-                store::<S, N>(&mut pair.transmittance, t_before);
-                store::<S, N>(&mut pair.chain, chain);
-                sources[n] = k as u32;
-                n += any as usize;
             }
             // Back to front.
             let d_one = load::<S, N>(&d_one);
@@ -177,7 +177,7 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 let mut rows = [0usize; GROUP];
                 let mut at = [Prepared::default(); GROUP];
                 for m in 0..GROUP {
-                    let source = sources[(begin + m).min(end - 1)] as usize;
+                    let source = (begin + m).min(end - 1);
                     slots[m] = entries[source] as usize;
                     rows[m] = slots[m] * stride;
                     at[m] = prepared[source];
