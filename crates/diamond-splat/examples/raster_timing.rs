@@ -93,7 +93,84 @@ fn measure(name: &str, n: usize, side: u32, channels: usize, repeats: usize) {
     );
 }
 
+/// The blending roofline: pairs per second of one thread on a tile of 8 × 8 pixels with everything in the first cache:
+/// offset, conic, 2^x by a polynomial, clamp, threshold, transmittance, three colours.
+struct Roofline {
+    splats: Vec<[f32; 9]>,
+    repeats: usize,
+}
+
+impl pulp::WithSimd for Roofline {
+    type Output = (f64, f32);
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, s: S) -> (f64, f32) {
+        let lanes = S::F32_LANES;
+        let side = 8;
+        let xs: Vec<f32> = (0..64).map(|i| (i % side) as f32 + 0.5).collect();
+        let ys: Vec<f32> = (0..64).map(|i| (i / side) as f32 + 0.5).collect();
+        let mut check = 0.0;
+        let start = Instant::now();
+        for _ in 0..self.repeats {
+            let splats = std::hint::black_box(&self.splats);
+            for k in 0..64 / lanes {
+                let x = S::as_simd_f32s(&xs[k * lanes..]).0[0];
+                let y = S::as_simd_f32s(&ys[k * lanes..]).0[0];
+                let zero = s.splat_f32s(std::hint::black_box(0.0));
+                let (mut t, mut r, mut g, mut b) = (s.splat_f32s(1.0), zero, zero, zero);
+                for p in splats {
+                    let dx = s.sub_f32s(x, s.splat_f32s(p[0]));
+                    let dy = s.sub_f32s(y, s.splat_f32s(p[1]));
+                    let q = s.mul_add_f32s(
+                        dx,
+                        s.mul_add_f32s(s.splat_f32s(p[2]), dx, s.mul_f32s(s.splat_f32s(p[3]), dy)),
+                        s.mul_add_f32s(s.mul_f32s(s.splat_f32s(p[4]), dy), dy, s.splat_f32s(p[5])),
+                    );
+                    let magic = s.splat_f32s(12_582_912.0);
+                    let shifted = s.add_f32s(q, magic);
+                    let f = s.sub_f32s(q, s.sub_f32s(shifted, magic));
+                    let mut e = s.splat_f32s(0.001_327_647_2);
+                    for c in [0.009_675_541, 0.055_507_133, 0.240_221_2, 0.693_146_97, 1.000_000_1] {
+                        e = s.mul_add_f32s(e, f, s.splat_f32s(c));
+                    }
+                    let bits = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted), s.splat_u32s(23));
+                    let a = s.transmute_f32s_u32s(s.add_u32s(s.transmute_u32s_f32s(e), bits));
+                    let a = s.min_f32s(a, s.splat_f32s(0.99));
+                    let keep = s.greater_than_or_equal_f32s(a, s.splat_f32s(1.0 / 255.0));
+                    let a = s.select_f32s(keep, a, zero);
+                    let w = s.mul_f32s(a, t);
+                    t = s.sub_f32s(t, w);
+                    r = s.mul_add_f32s(w, s.splat_f32s(p[6]), r);
+                    g = s.mul_add_f32s(w, s.splat_f32s(p[7]), g);
+                    b = s.mul_add_f32s(w, s.splat_f32s(p[8]), b);
+                }
+                check += s.reduce_sum_f32s(s.add_f32s(s.add_f32s(r, g), s.add_f32s(b, t)));
+            }
+        }
+        let pairs = (self.repeats * self.splats.len() * 64) as f64;
+        (pairs / start.elapsed().as_secs_f64(), check)
+    }
+}
+
+fn roofline() {
+    let mut random = Random(7);
+    let splats: Vec<[f32; 9]> = (0..64)
+        .map(|_| {
+            let mut r = || random.next() as f32;
+            [8.0 * r(), 8.0 * r(), -0.05 - 0.2 * r(), 0.05 * r(), -0.05 - 0.2 * r(), -4.0 * r(), r(), r(), r()]
+        })
+        .collect();
+    let mut best = 0.0f64;
+    for _ in 0..30 {
+        let (rate, check) = pulp::Arch::new().dispatch(Roofline { splats: splats.clone(), repeats: 400 });
+        std::hint::black_box(check);
+        best = best.max(rate);
+    }
+    println!("roofline: {:.2} G pairs/s on one thread", best * 1e-9);
+}
+
 fn main() {
+    roofline();
     let arguments: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
     println!("threads: {}; best times in ms", rayon::current_num_threads());
     if let [n, side, channels, repeats] = arguments[..] {

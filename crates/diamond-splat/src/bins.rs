@@ -5,7 +5,7 @@
 //! bucketed by row, each run on its own; a row's list is the concatenation of its buckets, so nothing is shared here
 //! either. A splat's place in a row's list is its slot. Each row sorts its slots by view-space z, ties by index, which
 //! costs less than one large sort, because everything that a row reads then lies close together.
-use crate::ellipse::{BANDS, BLOCK, Ellipse, band_spans, block_span};
+use crate::ellipse::{BANDS, BLOCK, Ellipse, Prepared, RowEllipse, band_spans, block_span};
 use crate::projection::{Outline, Splat};
 use pulp::Simd;
 use std::ops::Range;
@@ -15,10 +15,17 @@ pub(crate) const ROW_BANDS: usize = 2;
 /// Height of a row, pixels.
 pub(crate) const ROW: usize = ROW_BANDS * BLOCK;
 
-/// A splat in a row: its index in its run, and per band the blocks (first, one past last) that it meets.
+/// A splat in a row: all that the kernels need to know of it, so that a row reads one stretch of memory per run and
+/// nothing from elsewhere.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Slot {
-    pub splat: u32,
+    /// Position and shape.
+    pub ellipse: RowEllipse,
+    /// Index of the Gaussian.
+    pub gaussian: u32,
+    /// View-space z.
+    pub depth: f32,
+    /// Per band the blocks (first, one past last) that it meets.
     pub spans: [(u16, u16); ROW_BANDS],
 }
 
@@ -43,7 +50,8 @@ impl Run {
     pub fn new<S: Simd>(s: S, splats: Vec<Splat>, outlines: &[Outline], rows: usize, blocks: usize) -> Self {
         let mut run = Run { row_start: vec![0; rows + 1], rows: Vec::with_capacity(splats.len()), ..Default::default() };
         let mut by_splat: Vec<Slot> = Vec::with_capacity(4 * splats.len());
-        for (index, (splat, outline)) in splats.iter().zip(outlines).enumerate() {
+        for (splat, outline) in splats.iter().zip(outlines) {
+            let ellipse = Ellipse::new(splat);
             let (first, past) = (outline.rows[0] as usize / ROW, (outline.rows[1] as usize).div_ceil(ROW));
             run.rows.push((first as u32, past as u32));
             let mut row = first;
@@ -54,7 +62,12 @@ impl Run {
                     let span = |band: usize| {
                         block_span(low[ROW_BANDS * k + band], high[ROW_BANDS * k + band], blocks as f32)
                     };
-                    by_splat.push(Slot { splat: index as u32, spans: [span(0), span(1)] });
+                    by_splat.push(Slot {
+                        ellipse: ellipse.in_row(((row + k) * ROW) as f64 + 0.5 * ROW as f64),
+                        gaussian: splat.gaussian,
+                        depth: splat.depth,
+                        spans: [span(0), span(1)],
+                    });
                     run.places.push(run.row_start[row + k + 1]);
                     run.row_start[row + k + 1] += 1;
                 }
@@ -110,16 +123,6 @@ impl Rows {
     /// Number of rows.
     pub fn len(&self) -> usize {
         self.rows
-    }
-
-    /// The slots of one row with their splats, in order of Gaussians.
-    #[inline(always)]
-    pub fn for_each_slot(&self, row: usize, mut f: impl FnMut(&Slot, &Splat)) {
-        for run in &self.runs {
-            for slot in run.bucket(row) {
-                f(slot, &run.splats[slot.splat as usize]);
-            }
-        }
     }
 
     /// Calls `f(index in the run, row, slot)` for every place of every splat of one run, rows ascending.
@@ -182,13 +185,11 @@ impl Sorter {
 /// What a thread needs to work on a row; the buffers are used again for the next row.
 #[derive(Debug, Default)]
 pub(crate) struct RowScratch {
-    /// By slot.
-    pub ellipses: Vec<Ellipse>,
+    /// In order of Gaussians.
+    pub slots: Vec<Slot>,
     /// By slot: features, depth, zeros up to the stride.
     pub features: Vec<f32>,
-    gaussians: Vec<u32>,
     sorter: Sorter,
-    spans: Vec<[(u16, u16); ROW_BANDS]>,
     change: Vec<u32>,
     /// Entries of block `b` of band `a` are `start[a][b]..start[a][b + 1]`.
     start: [Vec<u32>; ROW_BANDS],
@@ -201,26 +202,26 @@ impl RowScratch {
     #[inline(always)]
     pub fn gather(&mut self, rows: &Rows, row: usize, features: &crate::Features, stride: usize) {
         let channels = features.channels;
-        self.ellipses.clear();
-        self.sorter.from.clear();
-        self.spans.clear();
-        self.gaussians.clear();
-        rows.for_each_slot(row, |slot, splat| {
-            self.sorter.from.push((splat.depth.to_bits(), self.spans.len() as u32));
-            self.spans.push(slot.spans);
-            self.ellipses.push(Ellipse::new(splat));
-            self.gaussians.push(splat.gaussian);
-        });
+        self.slots.clear();
+        for run in &rows.runs {
+            self.slots.extend_from_slice(run.bucket(row));
+        }
         self.features.clear();
-        self.features.resize(self.ellipses.len() * stride, 0.0);
-        let lines = self.features.chunks_exact_mut(stride);
-        for ((line, &gaussian), &(depth, _)) in lines.zip(&self.gaussians).zip(&self.sorter.from) {
+        self.features.resize(self.slots.len() * stride, 0.0);
+        for (line, slot) in self.features.chunks_exact_mut(stride).zip(&self.slots) {
             // A loop of its own: rows are short, and a call for each costs more than the copy.
-            for (to, from) in line.iter_mut().zip(features.row(gaussian as usize)) {
+            for (to, from) in line.iter_mut().zip(features.row(slot.gaussian as usize)) {
                 *to = *from;
             }
-            line[channels] = f32::from_bits(depth);
+            line[channels] = slot.depth;
         }
+    }
+
+    /// A splat in the block of a band whose centre has this x, px.
+    #[inline(always)]
+    pub fn prepare(&self, slot: u32, x: f64, band: usize) -> Prepared {
+        let y = (band * BLOCK) as f64 + 0.5 * BLOCK as f64 - 0.5 * ROW as f64;
+        self.slots[slot as usize].ellipse.prepare(x, y)
     }
 
     /// Makes the lists of the row that was gathered, of an image of this many blocks per band.
@@ -231,9 +232,11 @@ impl RowScratch {
         self.change.clear();
         self.change.resize(2 * ROW_BANDS * size, 0);
         let (begins, ends) = self.change.split_at_mut(ROW_BANDS * size);
-        for spans in &self.spans {
+        self.sorter.from.clear();
+        for (slot, at) in (0..).zip(&self.slots) {
+            self.sorter.from.push((at.depth.to_bits(), slot));
             for band in 0..ROW_BANDS {
-                let (first, past) = spans[band];
+                let (first, past) = at.spans[band];
                 begins[band * size + first as usize] += 1;
                 ends[band * size + past as usize] += 1;
             }
@@ -256,7 +259,7 @@ impl RowScratch {
             self.change.clear();
             self.change.extend_from_slice(&self.start[band]);
             for &(_, slot) in &self.sorter.from {
-                let (first, past) = self.spans[slot as usize][band];
+                let (first, past) = self.slots[slot as usize].spans[band];
                 for next in &mut self.change[first as usize..past as usize] {
                     self.entries[*next as usize] = slot;
                     *next += 1;
@@ -341,10 +344,10 @@ mod tests {
     #[test]
     fn block_lists_hold_each_span_in_depth_order() {
         let splat = |depth| Splat { depth, ..Default::default() };
-        let slot = |splat, a, b| Slot { splat, spans: [a, b] };
+        let slot = |depth, a, b| Slot { depth, spans: [a, b], ..Default::default() };
         let run = Run {
             splats: vec![splat(2.0), splat(9.0), splat(1.0)],
-            slots: vec![slot(0, (0, 2), (1, 3)), slot(1, (0, 0), (2, 3)), slot(2, (1, 3), (0, 0))],
+            slots: vec![slot(2.0, (0, 2), (1, 3)), slot(9.0, (0, 0), (2, 3)), slot(1.0, (1, 3), (0, 0))],
             row_start: vec![0, 3],
             rows: vec![(0, 1); 3],
             places: vec![0, 1, 2],

@@ -52,11 +52,10 @@ impl Scene<'_> {
         (self.height - row * ROW).div_ceil(BLOCK).min(ROW_BANDS)
     }
 
-    /// Centre of a block, px.
+    /// x of a block's centre, px.
     #[inline(always)]
-    pub fn centre(&self, at: Place) -> (f64, f64) {
-        let half = 0.5 * BLOCK as f64;
-        ((at.block * BLOCK) as f64 + half, (at.row * ROW + at.band * BLOCK) as f64 + half)
+    pub fn centre(&self, at: Place) -> f64 {
+        (at.block * BLOCK) as f64 + 0.5 * BLOCK as f64
     }
 
     /// Width and height of the part of a block that is inside the image, pixels.
@@ -163,7 +162,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
                 continue;
             }
             let place = Place { row, band, block };
-            let (x, y) = scene.centre(place);
+            let x = scene.centre(place);
             let mut t = load::<S, N>(&scene.initial_transmittance(place));
             let mut sum = [s.splat_f32s(0.0); N];
             acc.fill([0.0; LANES]);
@@ -171,7 +170,7 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
             for (batch, entries) in all.chunks(BATCH).enumerate() {
                 for (k, &slot) in entries.iter().enumerate() {
                     rows[k] = slot as usize * scene.stride;
-                    prepared[k] = scratch.ellipses[slot as usize].prepare(x, y);
+                    prepared[k] = scratch.prepare(slot, x, band);
                 }
                 let n = entries.len();
                 work.evaluated += (n * LANES) as u64;

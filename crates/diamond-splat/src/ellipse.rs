@@ -52,17 +52,45 @@ impl Ellipse {
         Self { mean: s.mean, chol: s.chol.map(|v| v * kappa), log2_opacity: s.log2_opacity }
     }
 
-    /// The values for the block whose centre is at `(x, y)` (px).
+    /// The same for a row whose centre line is at `y` (px).
     #[inline(always)]
-    pub fn prepare(&self, x: f64, y: f64) -> Prepared {
-        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
+    pub fn in_row(&self, y: f64) -> RowEllipse {
+        let dy = y - self.mean[1];
         let [l11, l21, l22] = self.chol;
-        Prepared {
-            u: (l11 * dx + l21 * dy) as f32,
+        RowEllipse {
+            u: l21 * dy - l11 * self.mean[0],
+            u_x: l11,
             v: (l22 * dy) as f32,
-            u_x: l11 as f32,
             u_y: l21 as f32,
             v_y: l22 as f32,
+            log2_opacity: self.log2_opacity,
+        }
+    }
+}
+
+/// A splat in one row, in kernel units.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct RowEllipse {
+    /// u on the row's centre line is `u + u_x · x`, x in px. In f64, since the two terms cancel.
+    u: f64,
+    u_x: f64,
+    /// v on the row's centre line.
+    v: f32,
+    u_y: f32,
+    v_y: f32,
+    log2_opacity: f32,
+}
+
+impl RowEllipse {
+    /// The values for the block whose centre is at `x` (px), `y` px below the row's centre line.
+    #[inline(always)]
+    pub fn prepare(&self, x: f64, y: f64) -> Prepared {
+        Prepared {
+            u: (self.u + self.u_x * x + self.u_y as f64 * y) as f32,
+            v: self.v + self.v_y * y as f32,
+            u_x: self.u_x as f32,
+            u_y: self.u_y,
+            v_y: self.v_y,
             log2_opacity: self.log2_opacity,
         }
     }

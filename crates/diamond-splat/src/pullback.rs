@@ -98,7 +98,7 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     let line = GEOMETRY + stride;
     scratch.gather(scene.rows, row, scene.features, stride);
     let scratch = &*scratch;
-    let mut grad = vec![0.0f32; scratch.ellipses.len() * line];
+    let mut grad = vec![0.0f32; scratch.slots.len() * line];
     let mut lists = lists.iter();
     let offsets = Offsets::<S, N>::new();
     let basis = moment_basis();
@@ -117,10 +117,10 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 continue;
             }
             let place = Place { row, band, block };
-            let centre = scene.centre(place);
+            let x = scene.centre(place);
             prepared.clear();
             for &slot in entries {
-                prepared.push(scratch.ellipses[slot as usize].prepare(centre.0, centre.1));
+                prepared.push(scratch.prepare(slot, x, band));
             }
             let (width, height) = scene.size(place);
             let mut d_one = [0.0f32; LANES];
