@@ -190,6 +190,8 @@ pub(crate) struct RowScratch {
     /// By slot: features, depth, zeros up to the stride.
     pub features: Vec<f32>,
     sorter: Sorter,
+    /// By slot, once more: in the order of depth it is read at random.
+    spans: Vec<[(u16, u16); ROW_BANDS]>,
     change: Vec<u32>,
     /// Entries of block `b` of band `a` are `start[a][b]..start[a][b + 1]`.
     start: [Vec<u32>; ROW_BANDS],
@@ -206,6 +208,11 @@ impl RowScratch {
         for run in &rows.runs {
             self.slots.extend_from_slice(run.bucket(row));
         }
+        // Touched first, by a loop that does nothing else, so that many cache misses are under way at once.
+        let touched = self.slots.iter().fold(0u32, |bits, slot| {
+            bits | features.row(slot.gaussian as usize).first().map_or(0, |v| v.to_bits())
+        });
+        std::hint::black_box(touched);
         self.features.clear();
         self.features.resize(self.slots.len() * stride, 0.0);
         for (line, slot) in self.features.chunks_exact_mut(stride).zip(&self.slots) {
@@ -233,8 +240,10 @@ impl RowScratch {
         self.change.resize(2 * ROW_BANDS * size, 0);
         let (begins, ends) = self.change.split_at_mut(ROW_BANDS * size);
         self.sorter.from.clear();
+        self.spans.clear();
         for (slot, at) in (0..).zip(&self.slots) {
             self.sorter.from.push((at.depth.to_bits(), slot));
+            self.spans.push(at.spans);
             for band in 0..ROW_BANDS {
                 let (first, past) = at.spans[band];
                 begins[band * size + first as usize] += 1;
@@ -259,7 +268,7 @@ impl RowScratch {
             self.change.clear();
             self.change.extend_from_slice(&self.start[band]);
             for &(_, slot) in &self.sorter.from {
-                let (first, past) = self.slots[slot as usize].spans[band];
+                let (first, past) = self.spans[slot as usize][band];
                 for next in &mut self.change[first as usize..past as usize] {
                     self.entries[*next as usize] = slot;
                     *next += 1;
