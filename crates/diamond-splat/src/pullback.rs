@@ -12,6 +12,7 @@ use crate::bins::{Reached, RowScratch};
 use crate::blend::{Place, Scene, TOGETHER};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite, load, store, with_lanes};
+use glam::{Mat4, Vec4};
 use pulp::{Simd, WithSimd};
 
 /// Splats that go through the matrix products together.
@@ -23,24 +24,28 @@ const MOMENTS: usize = 16;
 pub(crate) const GEOMETRY: usize = 8;
 
 /// Gives for each of four splats its moments about a block's centre, `1, x, y, x², xy, y²`, as moments of `(u, v)`, which
-/// is affine in x and y.
+/// is affine in x and y. Four splats at a time: a vector per quantity.
 #[inline(always)]
-fn whiten(at: &[Prepared; GROUP], m: &[[f32; GEOMETRY]; GROUP]) -> [[f32; GEOMETRY]; GROUP] {
+fn whiten(at: &[Prepared; GROUP], m: &[[f32; MOMENTS]; GROUP]) -> [[f32; GEOMETRY]; GROUP] {
+    let four = |k: usize, first: usize| Vec4::from_slice(&m[k][first..first + 4]);
+    let low = Mat4::from_cols(four(0, 0), four(1, 0), four(2, 0), four(3, 0)).transpose();
+    let high = Mat4::from_cols(four(0, 4), four(1, 4), four(2, 4), four(3, 4)).transpose();
+    let (s, x, y, xx, xy, yy) = (low.x_axis, low.y_axis, low.z_axis, low.w_axis, high.x_axis, high.y_axis);
+    let affine = |p: &Prepared| Vec4::new(p.u, p.v, p.u_x, p.u_y);
+    let affine = Mat4::from_cols(affine(&at[0]), affine(&at[1]), affine(&at[2]), affine(&at[3])).transpose();
+    let (u, v, a, b) = (affine.x_axis, affine.y_axis, affine.z_axis, affine.w_axis);
+    let c = Vec4::new(at[0].v_y, at[1].v_y, at[2].v_y, at[3].v_y);
+    let along_u = a * x + b * y;
+    let (of_u, of_v) = (u * s + along_u, v * s + c * y);
+    let uu = u * (of_u + along_u) + a * (a * xx + 2.0 * b * xy) + b * b * yy;
+    let uv = u * of_v + v * along_u + c * (a * xy + b * yy);
+    let vv = v * (of_v + c * y) + c * c * yy;
+    let low = Mat4::from_cols(s, of_u, of_v, uu).transpose().to_cols_array_2d();
+    let high = Mat4::from_cols(uv, vv, Vec4::ZERO, Vec4::ZERO).transpose().to_cols_array_2d();
     let mut to = [[0.0; GEOMETRY]; GROUP];
     for k in 0..GROUP {
-        let [s, x, y, xx, xy, yy, ..] = m[k];
-        let Prepared { u, v, u_x: a, u_y: b, v_y: c, .. } = at[k];
-        let lin = a * x + b * y;
-        to[k] = [
-            s,
-            u * s + lin,
-            v * s + c * y,
-            u * (u * s + 2.0 * lin) + a * (a * xx + 2.0 * b * xy) + b * b * yy,
-            u * (v * s + c * y) + v * lin + c * (a * xy + b * yy),
-            v * (v * s + 2.0 * c * y) + c * c * yy,
-            0.0,
-            0.0,
-        ];
+        to[k][..4].copy_from_slice(&low[k]);
+        to[k][4..].copy_from_slice(&high[k]);
     }
     to
 }
@@ -101,7 +106,8 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     let mut grad = vec![0.0f32; scratch.slots.len() * line];
     let mut lists = lists.iter();
     let offsets = Offsets::<S, N>::new();
-    let basis = moment_basis();
+    // Hidden from the compiler, which would make constants of it and four long chains of additions.
+    let basis = std::hint::black_box(moment_basis());
     let limits = Limits::new(s, &scene.limits);
     let zero = limits.zero;
     let mut prepared: Vec<Prepared> = Vec::new();
@@ -172,7 +178,7 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
             let mut end = n;
             while end > 0 {
                 let begin = end.saturating_sub(GROUP);
-                // In a short group the last splat stands in for the missing ones; their results are not used.
+                // In a short group the last splat stands in for the missing ones, with weights of 0.
                 let mut slots = [0usize; GROUP];
                 let mut rows = [0usize; GROUP];
                 let mut at = [Prepared::default(); GROUP];
@@ -213,26 +219,25 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                 // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
                 let mut about_centre = [[0.0f32; MOMENTS]; GROUP];
                 let mut c = 0;
-                while c < GEOMETRY {
-                    let sums = product::<S, 1>(s, &g, &basis.as_flattened()[c..], MOMENTS);
+                // The stride is a multiple of both.
+                while c < GEOMETRY.max(S::F32_LANES) {
+                    let right = [&basis.as_flattened()[c..], &by_pixel[c..]];
+                    let [sums, features] = products::<S>(s, [&g, &w], right, [MOMENTS, stride]);
                     for m in 0..GROUP {
                         let (to, _) = S::as_mut_simd_f32s(&mut about_centre[m][c..c + S::F32_LANES]);
-                        to[0] = sums[m][0];
+                        to[0] = sums[m];
+                        let to = slots[m] * line + GEOMETRY + c;
+                        add::<S>(s, &mut grad[to..to + S::F32_LANES], features[m]);
                     }
                     c += S::F32_LANES;
                 }
-                let mut raw = [[0.0f32; GEOMETRY]; GROUP];
+                let moments = whiten(&at, &about_centre);
                 for m in 0..GROUP {
-                    raw[m].copy_from_slice(&about_centre[m][..GEOMETRY]);
-                }
-                let moments = whiten(&at, &raw);
-                for m in 0..end - begin {
                     let to = &mut grad[slots[m] * line..][..GEOMETRY];
                     for k in 0..GEOMETRY {
                         to[k] += moments[m][k];
                     }
                 }
-                let mut c = 0;
                 while c < stride {
                     let two = c + 2 * S::F32_LANES <= stride;
                     let sums = if two {
@@ -245,7 +250,7 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
                         }
                         sums
                     };
-                    for m in 0..end - begin {
+                    for m in 0..GROUP {
                         let to = slots[m] * line + GEOMETRY + c;
                         add::<S>(s, &mut grad[to..to + S::F32_LANES], sums[m][0]);
                         if two {
@@ -293,6 +298,27 @@ fn product<S: Simd, const V: usize>(
             let l = s.splat_f32s(left[m][lane]);
             for v in 0..V {
                 sums[m][v] = s.mul_add_e_f32s(l, r[v], sums[m][v]);
+            }
+        }
+    }
+    sums
+}
+
+/// `Σ_lane left[m][lane] · right[lane · stride..]` for two pairs of factors at once and one vector of columns: so many
+/// sums that none waits for itself.
+#[inline(always)]
+fn products<S: Simd>(
+    s: S,
+    left: [&[[f32; LANES]; GROUP]; 2],
+    right: [&[f32]; 2],
+    stride: [usize; 2],
+) -> [[S::f32s; GROUP]; 2] {
+    let mut sums = [[s.splat_f32s(0.0); GROUP]; 2];
+    for lane in 0..LANES {
+        for side in 0..2 {
+            let (r, _) = S::as_simd_f32s(&right[side][lane * stride[side]..][..S::F32_LANES]);
+            for m in 0..GROUP {
+                sums[side][m] = s.mul_add_e_f32s(s.splat_f32s(left[side][m][lane]), r[0], sums[side][m]);
             }
         }
     }
