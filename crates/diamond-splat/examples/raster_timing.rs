@@ -59,7 +59,12 @@ fn measure(name: &str, n: usize, side: u32, channels: usize, repeats: usize) {
     let half = 0.5 * side as f32;
     let intrinsics = Intrinsics { fx: side as f32, fy: side as f32, cx: half, cy: half, width: side, height: side };
     let camera = Camera { intrinsics, pose: Pose::IDENTITY };
-    let config = RasterConfig { max_alpha: 0.999, near: 0.01, count_blended: std::env::var("COUNT").is_ok(), ..Default::default() };
+    let config = RasterConfig {
+        max_alpha: 0.999,
+        near: 0.01,
+        count_blended: std::env::var("COUNT").is_ok(),
+        ..Default::default()
+    };
     let mut d = RasterGrad::zeros(side as usize, side as usize, channels);
     for image in [&mut d.features, &mut d.opacity, &mut d.depth] {
         image.data_mut().iter_mut().enumerate().for_each(|(i, v)| *v = (i % 7) as f32 - 3.0);
@@ -72,7 +77,13 @@ fn measure(name: &str, n: usize, side: u32, channels: usize, repeats: usize) {
         let elapsed = || [start.elapsed().as_secs_f64() * 1e3, processor_ms() - used];
         let Ok((raster, pullback)) = rasterize(&gaussians, &features, &camera, &config) else { return };
         let forward = elapsed();
-        if std::env::var("FWD").is_ok() { for (b, v) in best.iter_mut().zip(forward) { *b = b.min(v); } std::hint::black_box((&raster, &pullback)); continue; }
+        if std::env::var("FWD").is_ok() {
+            for (b, v) in best.iter_mut().zip(forward) {
+                *b = b.min(v);
+            }
+            std::hint::black_box((&raster, &pullback));
+            continue;
+        }
         let Ok(pull) = pullback.pull(&d) else { return };
         let both = elapsed();
         for (b, v) in best.iter_mut().zip(forward.into_iter().chain(both)) {

@@ -1,139 +1,180 @@
-//! Who is blended where, and in which order: rows, depth order within a row, blocks.
+//! Who is blended where, and in which order: regions, depth order within a region, blocks.
 //!
-//! A row of the image, two bands of 4 × 4 blocks high, is the unit of work of a thread: it owns a contiguous piece of
-//! the image, so rows run in parallel without sharing anything. Runs of consecutive Gaussians are projected and
-//! bucketed by row, each run on its own; a row's list is the concatenation of its buckets, so nothing is shared here
-//! either. A splat's place in a row's list is its slot. Each row sorts its slots by view-space z, ties by index, which
-//! costs less than one large sort, because everything that a row reads then lies close together.
-use crate::ellipse::{BANDS, BLOCK, Ellipse, Prepared, RowEllipse, band_spans, block_span};
+//! A region of 64 × 32 pixels is the unit of work of a thread: all that it reads and writes fits in the second cache,
+//! and few splats meet more than two. Runs of consecutive Gaussians are projected and bucketed by region, each run on
+//! its own; a region's list is the concatenation of its buckets, so that nothing is shared. A splat's place in a
+//! region's list is its slot. Each region sorts its slots by view-space z, ties by index, which costs less than one
+//! large sort, because everything that is read then lies close together.
+use crate::ellipse::{BANDS, BLOCK, Ellipse, Prepared, band_spans, block_span};
 use crate::projection::{Outline, Splat};
 use pulp::Simd;
 use std::ops::Range;
 
-/// Bands of a row.
-pub(crate) const ROW_BANDS: usize = 2;
-/// Height of a row, pixels.
-pub(crate) const ROW: usize = ROW_BANDS * BLOCK;
+/// Blocks of a region side by side. At most 16: a span is two numbers of four bits.
+pub(crate) const COLUMNS: usize = 16;
+/// Blocks of a region one below the other, that is bands.
+pub(crate) const ROWS: usize = 8;
+/// Width and height of a region, pixels.
+pub(crate) const REGION: [usize; 2] = [COLUMNS * BLOCK, ROWS * BLOCK];
 
-/// A splat in a row: all that the kernels need to know of it, so that a row reads one stretch of memory per run and
-/// nothing from elsewhere.
-#[derive(Debug, Clone, Copy, Default)]
+/// The blocks of a region in one band that a splat meets: first and last in four bits each; none if first > last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Span(u8);
+
+impl Span {
+    const NONE: Span = Span(0x10);
+
+    /// The part of the blocks `first..past` of the image's band that is in the region's columns `start..`.
+    #[inline(always)]
+    fn new((first, past): (u16, u16), start: usize) -> Span {
+        let first = (first as usize).max(start) - start;
+        let past = (past as usize).min(start + COLUMNS);
+        if first + start < past { Span(((past - 1 - start) | first << 4) as u8) } else { Span::NONE }
+    }
+
+    /// First and one past last.
+    #[inline(always)]
+    fn range(self) -> Range<usize> {
+        let last = (self.0 & 15) as usize;
+        (self.0 >> 4) as usize..last + 1
+    }
+}
+
+/// A splat in a region: all that the kernels need to know of it, so that a region reads one stretch of memory per run
+/// and nothing from elsewhere. A cache line.
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Slot {
     /// Position and shape.
-    pub ellipse: RowEllipse,
+    pub ellipse: Ellipse,
     /// Index of the Gaussian.
     pub gaussian: u32,
     /// View-space z.
     pub depth: f32,
-    /// Per band the blocks (first, one past last) that it meets.
-    pub spans: [(u16, u16); ROW_BANDS],
+    /// By band.
+    pub spans: [Span; ROWS],
 }
 
-/// The splats of consecutive Gaussians, bucketed by row.
+/// The splats of consecutive Gaussians, bucketed by region.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Run {
     /// In order of Gaussians.
     pub splats: Vec<Splat>,
-    /// By row, then splat.
+    /// By region, then splat.
     slots: Vec<Slot>,
-    /// Slots of row `r` are `row_start[r]..row_start[r + 1]`.
-    row_start: Vec<u32>,
-    /// By splat: the rows (first, one past last).
-    rows: Vec<(u32, u32)>,
-    /// By splat, then row: place in the row's bucket.
-    places: Vec<u32>,
+    /// Slots of region `r` are `region_start[r]..region_start[r + 1]`.
+    region_start: Vec<u32>,
+    /// Places of splat `i` are `place_start[i]..place_start[i + 1]`.
+    place_start: Vec<u32>,
+    /// Region, and place in the region's bucket.
+    places: Vec<(u32, u32)>,
 }
 
 impl Run {
-    /// Buckets the splats of one run in an image of so many rows and blocks per band.
+    /// Buckets the splats of one run in an image of this size, pixels.
     #[inline(always)]
-    pub fn new<S: Simd>(s: S, splats: Vec<Splat>, outlines: &[Outline], rows: usize, blocks: usize) -> Self {
-        let mut run = Run { row_start: vec![0; rows + 1], rows: Vec::with_capacity(splats.len()), ..Default::default() };
-        let mut by_splat: Vec<Slot> = Vec::with_capacity(4 * splats.len());
+    pub fn new<S: Simd>(s: S, splats: Vec<Splat>, outlines: &[Outline], size: [usize; 2]) -> Self {
+        let grid = grid(size);
+        let blocks = size[0].div_ceil(BLOCK) as f32;
+        let mut run = Run {
+            region_start: vec![0; grid[0] * grid[1] + 1],
+            place_start: Vec::with_capacity(splats.len() + 1),
+            places: Vec::with_capacity(3 * splats.len()),
+            ..Default::default()
+        };
+        let mut by_splat: Vec<Slot> = Vec::with_capacity(3 * splats.len());
         for (splat, outline) in splats.iter().zip(outlines) {
-            let ellipse = Ellipse::new(splat);
-            let (first, past) = (outline.rows[0] as usize / ROW, (outline.rows[1] as usize).div_ceil(ROW));
-            run.rows.push((first as u32, past as u32));
-            let mut row = first;
-            while row < past {
-                let count = (past - row).min(BANDS / ROW_BANDS);
-                let (low, high) = band_spans(s, splat, outline, row * ROW_BANDS, count * ROW_BANDS);
-                for k in 0..count {
-                    let span = |band: usize| {
-                        block_span(low[ROW_BANDS * k + band], high[ROW_BANDS * k + band], blocks as f32)
-                    };
-                    by_splat.push(Slot {
-                        ellipse: ellipse.in_row(((row + k) * ROW) as f64 + 0.5 * ROW as f64),
-                        gaussian: splat.gaussian,
-                        depth: splat.depth,
-                        spans: [span(0), span(1)],
-                    });
-                    run.places.push(run.row_start[row + k + 1]);
-                    run.row_start[row + k + 1] += 1;
+            run.place_start.push(run.places.len() as u32);
+            let mut slot = Slot {
+                ellipse: Ellipse::new(splat),
+                gaussian: splat.gaussian,
+                depth: splat.depth,
+                spans: [Span::NONE; ROWS],
+            };
+            let of = |pixels: [u32; 2], side: usize| pixels[0] as usize / side..(pixels[1] as usize).div_ceil(side);
+            let columns = of(outline.columns, REGION[0]);
+            for y in of(outline.rows, REGION[1]) {
+                let mut spans = [(0, 0); ROWS];
+                let mut band = 0;
+                while band < ROWS {
+                    let (low, high) = band_spans(s, splat, outline, y * ROWS + band);
+                    for k in 0..BANDS {
+                        spans[band + k] = block_span(low[k], high[k], blocks);
+                    }
+                    band += BANDS;
                 }
-                row += count;
+                for x in columns.clone() {
+                    for band in 0..ROWS {
+                        slot.spans[band] = Span::new(spans[band], x * COLUMNS);
+                    }
+                    if slot.spans == [Span::NONE; ROWS] {
+                        continue;
+                    }
+                    let region = y * grid[0] + x;
+                    by_splat.push(slot);
+                    let count = &mut run.region_start[region + 1];
+                    run.places.push((region as u32, *count));
+                    *count += 1;
+                }
             }
         }
-        for r in 0..rows {
-            run.row_start[r + 1] += run.row_start[r];
+        run.place_start.push(run.places.len() as u32);
+        let mut total = 0;
+        for start in &mut run.region_start {
+            total += *start;
+            *start = total;
         }
-        run.slots = vec![Slot::default(); by_splat.len()];
-        let mut at = 0;
-        for &(first, past) in &run.rows {
-            for row in first..past {
-                run.slots[(run.row_start[row as usize] + run.places[at]) as usize] = by_splat[at];
-                at += 1;
-            }
+        run.slots = by_splat.clone();
+        for (slot, &(region, place)) in by_splat.iter().zip(&run.places) {
+            run.slots[(run.region_start[region as usize] + place) as usize] = *slot;
         }
         run.splats = splats;
         run
     }
 
-    fn bucket(&self, row: usize) -> &[Slot] {
-        &self.slots[self.row_start[row] as usize..self.row_start[row + 1] as usize]
+    fn bucket(&self, region: usize) -> &[Slot] {
+        &self.slots[self.region_start[region] as usize..self.region_start[region + 1] as usize]
     }
+}
+
+/// Regions side by side and one below the other in an image of this size, pixels.
+pub(crate) fn grid(size: [usize; 2]) -> [usize; 2] {
+    [size[0].div_ceil(REGION[0]), size[1].div_ceil(REGION[1])]
 }
 
 /// The runs of a view.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Rows {
+pub(crate) struct Bins {
     pub runs: Vec<Run>,
     /// By run: its splats are these of the whole.
     pub ranges: Vec<Range<usize>>,
-    /// By run, then row: the row's slots before this run.
+    /// By run, then region: the region's slots before this run.
     slot_base: Vec<u32>,
-    rows: usize,
+    /// Number of regions.
+    pub regions: usize,
 }
 
-impl Rows {
-    pub fn new(runs: Vec<Run>, rows: usize) -> Self {
-        let mut slot_base = Vec::with_capacity(runs.len() * rows);
+impl Bins {
+    pub fn new(runs: Vec<Run>, regions: usize) -> Self {
+        let mut slot_base = Vec::with_capacity(runs.len() * regions);
         let mut ranges = Vec::with_capacity(runs.len());
-        let mut total = vec![0u32; rows];
+        let mut total = vec![0u32; regions];
         let mut splats = 0;
         for run in &runs {
             slot_base.extend_from_slice(&total);
-            (0..rows).for_each(|r| total[r] += run.row_start[r + 1] - run.row_start[r]);
+            (0..regions).for_each(|r| total[r] += run.region_start[r + 1] - run.region_start[r]);
             ranges.push(splats..splats + run.splats.len());
             splats += run.splats.len();
         }
-        Rows { runs, ranges, slot_base, rows }
+        Bins { runs, ranges, slot_base, regions }
     }
 
-    /// Number of rows.
-    pub fn len(&self) -> usize {
-        self.rows
-    }
-
-    /// Calls `f(index in the run, row, slot)` for every place of every splat of one run, rows ascending.
+    /// Calls `f(index in the run, region, slot)` for every place of every splat of one run, regions ascending.
     #[inline(always)]
     pub fn for_each_place(&self, run: usize, mut f: impl FnMut(usize, usize, usize)) {
-        let (base, run) = (&self.slot_base[run * self.rows..], &self.runs[run]);
-        let mut at = 0;
-        for (index, &(first, past)) in run.rows.iter().enumerate() {
-            for row in first as usize..past as usize {
-                f(index, row, (base[row] + run.places[at]) as usize);
-                at += 1;
+        let (base, run) = (&self.slot_base[run * self.regions..], &self.runs[run]);
+        for (index, places) in run.place_start.windows(2).enumerate() {
+            for &(region, place) in &run.places[places[0] as usize..places[1] as usize] {
+                f(index, region as usize, (base[region as usize] + place) as usize);
             }
         }
     }
@@ -182,41 +223,42 @@ impl Sorter {
     }
 }
 
-/// What a thread needs to work on a row; the buffers are used again for the next row.
+/// What a thread needs to work on a region; the buffers are used again for the next one.
 #[derive(Debug, Default)]
-pub(crate) struct RowScratch {
+pub(crate) struct Scratch {
     /// In order of Gaussians.
     pub slots: Vec<Slot>,
     /// By slot: features, depth, zeros up to the stride.
     pub features: Vec<f32>,
     sorter: Sorter,
     /// By slot, once more: in the order of depth it is read at random.
-    spans: Vec<[(u16, u16); ROW_BANDS]>,
-    change: Vec<u32>,
-    /// Entries of block `b` of band `a` are `start[a][b]..start[a][b + 1]`.
-    start: [Vec<u32>; ROW_BANDS],
+    spans: Vec<[Span; ROWS]>,
+    /// Entries of block `b` are `start[b]..start[b + 1]`, blocks row by row.
+    start: Vec<u32>,
+    next: Vec<u32>,
     /// Slots, per block in depth order.
     entries: Vec<u32>,
 }
 
-impl RowScratch {
-    /// Copies what the row's slots need to know of their splats: a row's worth fits in the cache.
+impl Scratch {
+    /// Copies what the region's slots need to know of their splats.
     #[inline(always)]
-    pub fn gather(&mut self, rows: &Rows, row: usize, features: &crate::Features, stride: usize) {
+    pub fn gather(&mut self, bins: &Bins, region: usize, features: &crate::Features, stride: usize) {
         let channels = features.channels;
         self.slots.clear();
-        for run in &rows.runs {
-            self.slots.extend_from_slice(run.bucket(row));
+        for run in &bins.runs {
+            self.slots.extend_from_slice(run.bucket(region));
         }
         // Touched first, by a loop that does nothing else, so that many cache misses are under way at once.
-        let touched = self.slots.iter().fold(0u32, |bits, slot| {
-            bits | features.row(slot.gaussian as usize).first().map_or(0, |v| v.to_bits())
-        });
+        let touched = self
+            .slots
+            .iter()
+            .fold(0u32, |bits, slot| bits | features.row(slot.gaussian as usize).first().map_or(0, |v| v.to_bits()));
         std::hint::black_box(touched);
         self.features.clear();
         self.features.resize(self.slots.len() * stride, 0.0);
         for (line, slot) in self.features.chunks_exact_mut(stride).zip(&self.slots) {
-            // A loop of its own: rows are short, and a call for each costs more than the copy.
+            // A loop of its own: lines are short, and a call for each costs more than the copy.
             for (to, from) in line.iter_mut().zip(features.row(slot.gaussian as usize)) {
                 *to = *from;
             }
@@ -224,57 +266,54 @@ impl RowScratch {
         }
     }
 
-    /// A splat in the block of a band whose centre has this x, px.
+    /// Makes the lists of the region that was gathered.
     #[inline(always)]
-    pub fn prepare(&self, slot: u32, x: f64, band: usize) -> Prepared {
-        let y = (band * BLOCK) as f64 + 0.5 * BLOCK as f64 - 0.5 * ROW as f64;
-        self.slots[slot as usize].ellipse.prepare(x, y)
-    }
-
-    /// Makes the lists of the row that was gathered, of an image of this many blocks per band.
-    #[inline(always)]
-    pub fn list(&mut self, blocks: usize) {
+    pub fn list(&mut self) {
         // Counts as running sums of where spans begin and end.
-        let size = blocks + 1;
-        self.change.clear();
-        self.change.resize(2 * ROW_BANDS * size, 0);
-        let (begins, ends) = self.change.split_at_mut(ROW_BANDS * size);
+        const SIZE: usize = COLUMNS + 1;
+        let (mut begins, mut ends) = ([[0u32; SIZE]; ROWS], [[0u32; SIZE]; ROWS]);
         self.sorter.from.clear();
         self.spans.clear();
         for (slot, at) in (0..).zip(&self.slots) {
             self.sorter.from.push((at.depth.to_bits(), slot));
             self.spans.push(at.spans);
-            for band in 0..ROW_BANDS {
-                let (first, past) = at.spans[band];
-                begins[band * size + first as usize] += 1;
-                ends[band * size + past as usize] += 1;
+            for band in 0..ROWS {
+                let span = at.spans[band].range();
+                begins[band][span.start] += 1;
+                ends[band][span.end] += 1;
             }
         }
+        self.start.clear();
         let mut total = 0u32;
-        for band in 0..ROW_BANDS {
+        for band in 0..ROWS {
             let mut covering = 0u32;
-            let start = &mut self.start[band];
-            start.clear();
-            start.push(total);
-            for block in 0..blocks {
-                covering = covering + begins[band * size + block] - ends[band * size + block];
+            for block in 0..COLUMNS {
+                self.start.push(total);
+                // An empty span ends where it begins.
+                covering = covering + begins[band][block] - ends[band][block];
                 total += covering;
-                start.push(total);
             }
         }
+        self.start.push(total);
         self.sorter.sort();
         self.entries.resize(total as usize, 0);
-        for band in 0..ROW_BANDS {
-            self.change.clear();
-            self.change.extend_from_slice(&self.start[band]);
-            for &(_, slot) in &self.sorter.from {
-                let (first, past) = self.spans[slot as usize][band];
-                for next in &mut self.change[first as usize..past as usize] {
+        self.next.clear();
+        self.next.extend_from_slice(&self.start);
+        for &(_, slot) in &self.sorter.from {
+            let spans = &self.spans[slot as usize];
+            for (span, next) in spans.iter().zip(self.next.chunks_exact_mut(COLUMNS)) {
+                for next in &mut next[span.range()] {
                     self.entries[*next as usize] = slot;
                     *next += 1;
                 }
             }
         }
+    }
+
+    /// A splat in the block whose centre is at `(x, y)`, px.
+    #[inline(always)]
+    pub fn prepare(&self, slot: u32, x: f64, y: f64) -> Prepared {
+        self.slots[slot as usize].ellipse.prepare(x, y)
     }
 
     /// Number of entries.
@@ -284,14 +323,12 @@ impl RowScratch {
 
     /// The entries of a block.
     #[inline(always)]
-    pub fn of(&self, band: usize, block: usize) -> &[u32] {
-        let start = &self.start[band];
-        &self.entries[start[block] as usize..start[block + 1] as usize]
+    pub fn of(&self, block: usize) -> &[u32] {
+        &self.entries[self.start[block] as usize..self.start[block + 1] as usize]
     }
 }
 
-/// The entries of a row's blocks that matter: later ones find every pixel saturated. Blocks side by side, each with
-/// its bands.
+/// The entries of a region's blocks that matter: later ones find every pixel saturated.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Reached {
     /// Slots, per block in depth order.
@@ -301,9 +338,9 @@ pub(crate) struct Reached {
 }
 
 impl Reached {
-    /// For so many blocks and entries.
-    pub fn with_capacity(blocks: usize, entries: usize) -> Self {
-        Self { entries: Vec::with_capacity(entries), counts: Vec::with_capacity(blocks) }
+    /// For so many entries.
+    pub fn with_capacity(entries: usize) -> Self {
+        Self { entries: Vec::with_capacity(entries), counts: Vec::with_capacity(ROWS * COLUMNS) }
     }
 
     /// Appends the entries of the next block.
@@ -351,26 +388,42 @@ mod tests {
     }
 
     #[test]
+    fn spans_are_cut_at_the_region() {
+        assert_eq!(Span::new((0, 0), 0), Span::NONE);
+        assert!(Span::NONE.range().is_empty());
+        assert_eq!(Span::new((3, 40), 0).range(), 3..16);
+        assert_eq!(Span::new((3, 40), 16).range(), 0..16);
+        assert_eq!(Span::new((3, 40), 32).range(), 0..8);
+        assert_eq!(Span::new((3, 40), 48), Span::NONE);
+        assert_eq!(Span::new((20, 21), 0), Span::NONE);
+        assert_eq!(Span::new((31, 32), 16).range(), 15..16);
+    }
+
+    #[test]
     fn block_lists_hold_each_span_in_depth_order() {
         let splat = |depth| Splat { depth, ..Default::default() };
-        let slot = |depth, a, b| Slot { depth, spans: [a, b], ..Default::default() };
+        let slot = |depth, a: Range<u16>, b: Range<u16>| {
+            let mut spans = [Span::NONE; ROWS];
+            (spans[0], spans[7]) = (Span::new((a.start, a.end), 0), Span::new((b.start, b.end), 0));
+            Slot { ellipse: Ellipse::default(), gaussian: 0, depth, spans }
+        };
         let run = Run {
             splats: vec![splat(2.0), splat(9.0), splat(1.0)],
-            slots: vec![slot(2.0, (0, 2), (1, 3)), slot(9.0, (0, 0), (2, 3)), slot(1.0, (1, 3), (0, 0))],
-            row_start: vec![0, 3],
-            rows: vec![(0, 1); 3],
-            places: vec![0, 1, 2],
+            slots: vec![slot(2.0, 0..2, 1..16), slot(9.0, 0..0, 2..3), slot(1.0, 1..3, 0..0)],
+            region_start: vec![0, 3],
+            place_start: vec![0, 1, 2, 3],
+            places: vec![(0, 0), (0, 1), (0, 2)],
         };
-        let rows = Rows::new(vec![run], 1);
-        let mut scratch = RowScratch::default();
-        let features = crate::Features { channels: 0, data: Vec::new() };
-        scratch.gather(&rows, 0, &features, 8);
-        scratch.list(3);
-        let of = |band| (0..3).map(|b| scratch.of(band, b).to_vec()).collect::<Vec<_>>();
+        let bins = Bins::new(vec![run], 1);
+        let mut scratch = Scratch::default();
+        scratch.gather(&bins, 0, &crate::Features { channels: 0, data: Vec::new() }, 8);
+        scratch.list();
+        let of = |band: usize| (0..3).map(|b| scratch.of(COLUMNS * band + b).to_vec()).collect::<Vec<_>>();
         assert_eq!(of(0), [vec![0], vec![2, 0], vec![2]]);
-        assert_eq!(of(1), [vec![], vec![0], vec![0, 1]]);
+        assert_eq!(of(7), [vec![], vec![0], vec![0, 1]]);
+        assert_eq!(scratch.of(127), [0]);
         let mut places = Vec::new();
-        rows.for_each_place(0, |splat, row, slot| places.push((splat, row, slot)));
+        bins.for_each_place(0, |splat, region, slot| places.push((splat, region, slot)));
         assert_eq!(places, [(0, 0, 0), (1, 0, 1), (2, 0, 2)]);
     }
 }

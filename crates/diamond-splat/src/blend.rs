@@ -1,11 +1,11 @@
-//! Forward blending of one row of blocks.
+//! Forward blending of one region.
 //!
 //! Per block of 16 pixels and per batch of splats two phases alternate: first the weights `w = α·T` front to back, then
 //! `Σ w f` for four channels at a time with the sums in registers, which is a small matrix product and as fast as one.
 //! Depth is one more channel (the splat's z); opacity is the sum of the weights.
-use crate::bins::{ROW, ROW_BANDS, Reached, RowScratch, Rows};
-use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::Features;
+use crate::bins::{Bins, COLUMNS, REGION, ROWS, Reached, Scratch, grid};
+use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Block, Limits, Offsets, Thresholds, alphas, any_positive, composite, load, store, with_lanes};
 use pulp::{Simd, WithSimd};
 
@@ -16,12 +16,12 @@ pub(crate) const TOGETHER: usize = 2;
 /// Channels that are accumulated together.
 pub(crate) const GROUP: usize = 4;
 
-/// What every row needs to know.
+/// What every region needs to know.
 pub(crate) struct Scene<'a> {
-    pub rows: &'a Rows,
+    pub bins: &'a Bins,
     /// By Gaussian.
     pub features: &'a Features,
-    /// Of a row's own copy of the features; a multiple of [`GROUP`] and of the vector width.
+    /// Of a region's own copy of the features; a multiple of [`GROUP`] and of the vector width.
     pub stride: usize,
     /// Without depth.
     pub channels: usize,
@@ -33,55 +33,56 @@ pub(crate) struct Scene<'a> {
     pub height: usize,
 }
 
-/// A block within a row.
+/// A block of the image, by its first pixel.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Place {
-    pub row: usize,
-    pub band: usize,
-    pub block: usize,
+    pub x: usize,
+    pub y: usize,
+    /// Width and height of the part that is inside the image, pixels.
+    pub size: [usize; 2],
 }
 
-impl Scene<'_> {
-    /// Blocks side by side.
-    pub fn blocks(&self) -> usize {
-        self.width.div_ceil(BLOCK)
-    }
-
-    /// Bands of row `row`: the last row of an image may have fewer than the others.
-    pub fn bands(&self, row: usize) -> usize {
-        (self.height - row * ROW).div_ceil(BLOCK).min(ROW_BANDS)
-    }
-
-    /// x of a block's centre, px.
+impl Place {
+    /// Centre, px.
     #[inline(always)]
-    pub fn centre(&self, at: Place) -> f64 {
-        (at.block * BLOCK) as f64 + 0.5 * BLOCK as f64
-    }
-
-    /// Width and height of the part of a block that is inside the image, pixels.
-    #[inline(always)]
-    pub fn size(&self, at: Place) -> (usize, usize) {
-        let (x, y) = (at.block * BLOCK, at.row * ROW + at.band * BLOCK);
-        ((self.width - x).min(BLOCK), (self.height - y).min(BLOCK))
-    }
-
-    /// Index within the row of the first pixel of line `y` of a block.
-    #[inline(always)]
-    pub fn pixel(&self, at: Place, y: usize) -> usize {
-        (at.band * BLOCK + y) * self.width + at.block * BLOCK
+    pub fn centre(&self) -> (f64, f64) {
+        let half = 0.5 * BLOCK as f64;
+        (self.x as f64 + half, self.y as f64 + half)
     }
 
     /// 1 for lanes inside the image, else 0: the transmittance to start with.
     #[inline(always)]
-    pub fn initial_transmittance(&self, at: Place) -> [f32; LANES] {
-        let (width, height) = self.size(at);
+    pub fn initial_transmittance(&self) -> [f32; LANES] {
         let mut t = [1.0; LANES];
-        if width < BLOCK || height < BLOCK {
+        if self.size != [BLOCK; 2] {
             for (lane, t) in t.iter_mut().enumerate() {
-                *t = (lane % BLOCK < width && lane / BLOCK < height) as u32 as f32;
+                *t = (lane % BLOCK < self.size[0] && lane / BLOCK < self.size[1]) as u32 as f32;
             }
         }
         t
+    }
+}
+
+impl Scene<'_> {
+    /// First pixel of a region.
+    pub fn corner(&self, region: usize) -> [usize; 2] {
+        let [columns, _] = grid([self.width, self.height]);
+        [region % columns * REGION[0], region / columns * REGION[1]]
+    }
+
+    /// Width and height of the part of a region that is inside the image, pixels.
+    pub fn region_size(&self, region: usize) -> [usize; 2] {
+        let [x, y] = self.corner(region);
+        [(self.width - x).min(REGION[0]), (self.height - y).min(REGION[1])]
+    }
+
+    /// A block of a region; `None` outside the image.
+    #[inline(always)]
+    pub fn place(&self, region: usize, block: usize) -> Option<Place> {
+        let [x, y] = self.corner(region);
+        let (x, y) = (x + block % COLUMNS * BLOCK, y + block / COLUMNS * BLOCK);
+        let size = [self.width.saturating_sub(x).min(BLOCK), self.height.saturating_sub(y).min(BLOCK)];
+        (size[0] > 0 && size[1] > 0).then_some(Place { x, y, size })
     }
 
     /// Groups of channels that hold the features and the depth.
@@ -90,22 +91,25 @@ impl Scene<'_> {
     }
 }
 
-/// The forward pass of one row.
-pub(crate) struct RowForward<'a> {
+/// The forward pass of one region.
+pub(crate) struct RegionForward<'a> {
     pub scene: &'a Scene<'a>,
-    pub row: usize,
-    pub scratch: &'a mut RowScratch,
-    /// The row's pixels × channels.
-    pub features: &'a mut [f32],
-    /// The row's pixels.
-    pub opacity: &'a mut [f32],
-    /// The row's pixels.
-    pub depth: &'a mut [f32],
+    pub region: usize,
+    pub scratch: &'a mut Scratch,
+}
+
+/// What a region looks like; empty where nothing is seen.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct RegionImage {
+    /// Pixels × channels, then opacity, then depth, of the region's part of the image.
+    pub data: Vec<f32>,
+    pub lists: Reached,
+    pub work: RegionWork,
 }
 
 /// How much was done.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct RowWork {
+pub(crate) struct RegionWork {
     /// (splat, block) pairs.
     pub entries: u64,
     /// (splat, pixel) pairs whose alpha was evaluated.
@@ -114,36 +118,41 @@ pub(crate) struct RowWork {
     pub blended: u64,
 }
 
-impl WithSimd for RowForward<'_> {
-    type Output = (Reached, RowWork);
+impl WithSimd for RegionForward<'_> {
+    type Output = RegionImage;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> (Reached, RowWork) {
-        if self.scene.smooth {
-            with_lanes!(s: S, forward_row_smooth(self))
-        } else {
-            with_lanes!(s: S, forward_row_hard(self))
-        }
+    fn with_simd<S: Simd>(self, s: S) -> RegionImage {
+        if self.scene.smooth { with_lanes!(s: S, forward_smooth(self)) } else { with_lanes!(s: S, forward_hard(self)) }
     }
 }
 
 #[inline(always)]
-fn forward_row_hard<S: Simd, const N: usize>(s: S, row: RowForward) -> (Reached, RowWork) {
-    forward_row::<S, N, false>(s, row)
+fn forward_hard<S: Simd, const N: usize>(s: S, region: RegionForward) -> RegionImage {
+    forward::<S, N, false>(s, region)
 }
 
 #[inline(always)]
-fn forward_row_smooth<S: Simd, const N: usize>(s: S, row: RowForward) -> (Reached, RowWork) {
-    forward_row::<S, N, true>(s, row)
+fn forward_smooth<S: Simd, const N: usize>(s: S, region: RegionForward) -> RegionImage {
+    forward::<S, N, true>(s, region)
 }
 
 #[inline(always)]
-fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForward) -> (Reached, RowWork) {
-    let RowForward { scene, row, scratch, features, opacity, depth } = work;
-    scratch.gather(scene.rows, row, scene.features, scene.stride);
-    scratch.list(scene.blocks());
+fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForward) -> RegionImage {
+    let RegionForward { scene, region, scratch } = region;
+    scratch.gather(scene.bins, region, scene.features, scene.stride);
+    if scratch.slots.is_empty() {
+        return RegionImage::default();
+    }
+    scratch.list();
     let scratch = &*scratch;
-    let mut lists = Reached::with_capacity(scene.blocks() * ROW_BANDS, scratch.entries());
+    let mut lists = Reached::with_capacity(scratch.entries());
+    let [corner_x, corner_y] = scene.corner(region);
+    let [width, height] = scene.region_size(region);
+    let channels = scene.channels;
+    let mut data = vec![0.0f32; width * height * (channels + 2)];
+    let (features, rest) = data.split_at_mut(width * height * channels);
+    let (opacity, depth) = rest.split_at_mut(width * height);
     let groups = scene.groups();
     let limits = Limits::new(s, &scene.limits);
     let offsets = Offsets::<S, N>::new();
@@ -153,102 +162,99 @@ fn forward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, work: RowForwa
     // Where a splat's features begin.
     let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
-    let mut work = RowWork { entries: scratch.entries() as u64, ..Default::default() };
-    for block in 0..scene.blocks() {
-        for band in 0..scene.bands(row) {
-            let all = scratch.of(band, block);
-            if all.is_empty() {
-                lists.push(&[]);
-                continue;
+    let mut work = RegionWork { entries: scratch.entries() as u64, ..Default::default() };
+    for block in 0..ROWS * COLUMNS {
+        let all = scratch.of(block);
+        let Some(place) = scene.place(region, block).filter(|_| !all.is_empty()) else {
+            lists.push(&[]);
+            continue;
+        };
+        let (x, y) = place.centre();
+        let mut t = load::<S, N>(&place.initial_transmittance());
+        let mut sum = [s.splat_f32s(0.0); N];
+        acc.fill([0.0; LANES]);
+        let mut reach = 0;
+        for (batch, entries) in all.chunks(BATCH).enumerate() {
+            for (k, &slot) in entries.iter().enumerate() {
+                rows[k] = slot as usize * scene.stride;
+                prepared[k] = scratch.prepare(slot, x, y);
             }
-            let place = Place { row, band, block };
-            let x = scene.centre(place);
-            let mut t = load::<S, N>(&scene.initial_transmittance(place));
-            let mut sum = [s.splat_f32s(0.0); N];
-            acc.fill([0.0; LANES]);
-            let mut reach = 0;
-            for (batch, entries) in all.chunks(BATCH).enumerate() {
-                for (k, &slot) in entries.iter().enumerate() {
-                    rows[k] = slot as usize * scene.stride;
-                    prepared[k] = scratch.prepare(slot, x, band);
+            let n = entries.len();
+            work.evaluated += (n * LANES) as u64;
+            if let Some(beyond) = prepared.get_mut(n) {
+                *beyond = Prepared::NOTHING;
+            }
+            // Phase 1: weights, front to back.
+            let pairs = prepared.as_chunks::<TOGETHER>().0.iter().zip(weights.as_chunks_mut::<TOGETHER>().0);
+            for (splats, weights) in pairs.take(n.div_ceil(TOGETHER)) {
+                let (a, _) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
+                for m in 0..TOGETHER {
+                    let w = composite::<S, N>(s, &a[m], &mut t, &limits);
+                    store::<S, N>(&mut weights[m], w);
                 }
-                let n = entries.len();
-                work.evaluated += (n * LANES) as u64;
-                if let Some(beyond) = prepared.get_mut(n) {
-                    *beyond = Prepared::NOTHING;
+            }
+            // Phase 2: Σ w and Σ w f.
+            for m in 0..n {
+                let w = load::<S, N>(&weights[m]);
+                for i in 0..N {
+                    sum[i] = s.add_f32s(sum[i], w[i]);
                 }
-                // Phase 1: weights, front to back.
-                let pairs = prepared.as_chunks::<TOGETHER>().0.iter().zip(weights.as_chunks_mut::<TOGETHER>().0);
-                for (splats, weights) in pairs.take(n.div_ceil(TOGETHER)) {
-                    let (a, _) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
-                    for m in 0..TOGETHER {
-                        let w = composite::<S, N>(s, &a[m], &mut t, &limits);
-                        store::<S, N>(&mut weights[m], w);
-                    }
+            }
+            for group in 0..groups {
+                let acc = &mut acc[group * GROUP..][..GROUP];
+                let mut sums: [Block<S, N>; GROUP] = [[limits.zero; N]; GROUP];
+                for c in 0..GROUP {
+                    sums[c] = load::<S, N>(&acc[c]);
                 }
-                // Phase 2: Σ w and Σ w f.
-                for m in 0..n {
-                    let w = load::<S, N>(&weights[m]);
-                    for i in 0..N {
-                        sum[i] = s.add_f32s(sum[i], w[i]);
-                    }
-                }
-                for group in 0..groups {
-                    let acc = &mut acc[group * GROUP..][..GROUP];
-                    let mut sums: [Block<S, N>; GROUP] = [[limits.zero; N]; GROUP];
+                for (w, row) in weights[..n].iter().zip(&rows) {
+                    let w = load::<S, N>(w);
+                    let at = row + group * GROUP;
+                    let f = &scratch.features[at..at + GROUP];
                     for c in 0..GROUP {
-                        sums[c] = load::<S, N>(&acc[c]);
-                    }
-                    for (w, row) in weights[..n].iter().zip(&rows) {
-                        let w = load::<S, N>(w);
-                        let at = row + group * GROUP;
-                        let f = &scratch.features[at..at + GROUP];
-                        for c in 0..GROUP {
-                            let f = s.splat_f32s(f[c]);
-                            for i in 0..N {
-                                sums[c][i] = s.mul_add_e_f32s(w[i], f, sums[c][i]);
-                            }
+                        let f = s.splat_f32s(f[c]);
+                        for i in 0..N {
+                            sums[c][i] = s.mul_add_e_f32s(w[i], f, sums[c][i]);
                         }
                     }
-                    for c in 0..GROUP {
-                        store::<S, N>(&mut acc[c], sums[c]);
-                    }
                 }
-                if scene.count {
-                    let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
-                    work.blended += weights[..n].iter().map(positive).sum::<u64>();
-                }
-                reach = batch * BATCH + n;
-                if !any_positive::<S, N>(s, &t) {
-                    // The last that any pixel saw.
-                    while n > 0 && weights[reach - batch * BATCH - 1] == [0.0; LANES] && reach > batch * BATCH + 1 {
-                        reach -= 1;
-                    }
-                    break;
+                for c in 0..GROUP {
+                    store::<S, N>(&mut acc[c], sums[c]);
                 }
             }
-            lists.push(&all[..reach]);
-            if reach == 0 {
-                continue;
+            if scene.count {
+                let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
+                work.blended += weights[..n].iter().map(positive).sum::<u64>();
             }
-            let mut total = [0.0f32; LANES];
-            store::<S, N>(&mut total, sum);
-            let (width, height) = scene.size(place);
-            for y in 0..height {
-                let (first, lane) = (scene.pixel(place, y), y * BLOCK);
-                opacity[first..first + width].copy_from_slice(&total[lane..lane + width]);
-                depth[first..first + width].copy_from_slice(&acc[scene.channels][lane..lane + width]);
-                let out = &mut features[first * scene.channels..(first + width) * scene.channels];
-                if scene.channels > 0 {
-                    for (x, out) in out.chunks_exact_mut(scene.channels).enumerate() {
-                        for (c, v) in out.iter_mut().enumerate() {
-                            *v = acc[c][lane + x];
-                        }
+            reach = batch * BATCH + n;
+            if !any_positive::<S, N>(s, &t) {
+                // The last that any pixel saw.
+                while n > 0 && weights[reach - batch * BATCH - 1] == [0.0; LANES] && reach > batch * BATCH + 1 {
+                    reach -= 1;
+                }
+                break;
+            }
+        }
+        lists.push(&all[..reach]);
+        if reach == 0 {
+            continue;
+        }
+        let mut total = [0.0f32; LANES];
+        store::<S, N>(&mut total, sum);
+        for line in 0..place.size[1] {
+            let first = (place.y - corner_y + line) * width + place.x - corner_x;
+            let (lanes, pixels) = (line * BLOCK..line * BLOCK + place.size[0], first..first + place.size[0]);
+            opacity[pixels.clone()].copy_from_slice(&total[lanes.clone()]);
+            depth[pixels.clone()].copy_from_slice(&acc[channels][lanes.clone()]);
+            let out = &mut features[pixels.start * channels..pixels.end * channels];
+            if channels > 0 {
+                for (lane, out) in lanes.zip(out.chunks_exact_mut(channels)) {
+                    for (c, v) in out.iter_mut().enumerate() {
+                        *v = acc[c][lane];
                     }
                 }
             }
         }
     }
     lists.shrink();
-    (lists, work)
+    RegionImage { data, lists, work }
 }

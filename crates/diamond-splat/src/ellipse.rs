@@ -52,15 +52,15 @@ impl Ellipse {
         Self { mean: s.mean, chol: s.chol.map(|v| v * kappa), log2_opacity: s.log2_opacity }
     }
 
-    /// The same for a row whose centre line is at `y` (px).
+    /// The values for the block whose centre is at `(x, y)` (px).
     #[inline(always)]
-    pub fn in_row(&self, y: f64) -> RowEllipse {
-        let dy = y - self.mean[1];
+    pub fn prepare(&self, x: f64, y: f64) -> Prepared {
+        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
         let [l11, l21, l22] = self.chol;
-        RowEllipse {
-            u: l21 * dy - l11 * self.mean[0],
-            u_x: l11,
+        Prepared {
+            u: (l11 * dx + l21 * dy) as f32,
             v: (l22 * dy) as f32,
+            u_x: l11 as f32,
             u_y: l21 as f32,
             v_y: l22 as f32,
             log2_opacity: self.log2_opacity,
@@ -68,48 +68,20 @@ impl Ellipse {
     }
 }
 
-/// A splat in one row, in kernel units.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct RowEllipse {
-    /// u on the row's centre line is `u + u_x · x`, x in px. In f64, since the two terms cancel.
-    u: f64,
-    u_x: f64,
-    /// v on the row's centre line.
-    v: f32,
-    u_y: f32,
-    v_y: f32,
-    log2_opacity: f32,
-}
-
-impl RowEllipse {
-    /// The values for the block whose centre is at `x` (px), `y` px below the row's centre line.
-    #[inline(always)]
-    pub fn prepare(&self, x: f64, y: f64) -> Prepared {
-        Prepared {
-            u: (self.u + self.u_x * x + self.u_y as f64 * y) as f32,
-            v: self.v + self.v_y * y as f32,
-            u_x: self.u_x as f32,
-            u_y: self.u_y,
-            v_y: self.v_y,
-            log2_opacity: self.log2_opacity,
-        }
-    }
-}
-
-/// Bands whose spans are computed in one call of [`band_spans`].
-pub(crate) const BANDS: usize = 16;
-const STEPS: [f32; BANDS] = {
-    let mut steps = [0.0; BANDS];
+/// Bands whose spans are computed in one call of [`band_spans`], which returns room for [`LANES`].
+pub(crate) const BANDS: usize = 8;
+/// At least one vector's worth.
+const STEPS: [f32; LANES] = {
+    let mut steps = [0.0; LANES];
     let mut k = 0;
-    while k < BANDS {
+    while k < LANES {
         steps[k] = (k * BLOCK) as f32;
         k += 1;
     }
     steps
 };
 
-/// The x-intervals (px) of the ellipse in consecutive bands of [`BLOCK`] rows of pixels, the first of which is `first`;
-/// only the first `count` (at most [`BANDS`]) are needed. Exact, between the outer pixel centres of a band; empty
+/// The x-intervals (px) of the ellipse in [`BANDS`] consecutive bands of [`BLOCK`] rows of pixels, the first of which is `first`. Exact, between the outer pixel centres of a band; empty
 /// (low > high) where the ellipse does not meet the band. `[eq:ellipse-band]`
 #[inline(always)]
 pub(crate) fn band_spans<S: Simd>(
@@ -117,8 +89,7 @@ pub(crate) fn band_spans<S: Simd>(
     splat: &Splat,
     outline: &Outline,
     first: usize,
-    count: usize,
-) -> ([f32; BANDS], [f32; BANDS]) {
+) -> ([f32; LANES], [f32; LANES]) {
     let [l11, l21, l22] = splat.chol;
     let [ex, ey] = splat.extent;
     let set = |v: f32| s.splat_f32s(v);
@@ -133,11 +104,11 @@ pub(crate) fn band_spans<S: Simd>(
     let top = set(((first * BLOCK) as f64 + 0.5 - splat.mean[1]) as f32);
     let (top_limit, bottom_limit, height) = (set(-ey), set(ey), set((BLOCK - 1) as f32));
     let (never_low, never_high) = (set(f32::MAX), set(f32::MIN));
-    let (mut low, mut high) = ([0.0f32; BANDS], [0.0f32; BANDS]);
+    let (mut low, mut high) = ([0.0f32; LANES], [0.0f32; LANES]);
     let (steps, _) = S::as_simd_f32s(&STEPS);
     let (lows, _) = S::as_mut_simd_f32s(&mut low);
     let (highs, _) = S::as_mut_simd_f32s(&mut high);
-    for k in 0..count.div_ceil(S::F32_LANES).min(steps.len()) {
+    for k in 0..BANDS.div_ceil(S::F32_LANES) {
         let y = s.add_f32s(top, steps[k]);
         let y0 = s.max_f32s(y, top_limit);
         let y1 = s.min_f32s(s.add_f32s(y, height), bottom_limit);
@@ -174,10 +145,10 @@ mod tests {
     struct Band(Splat, Outline);
 
     impl pulp::WithSimd for Band {
-        type Output = ([f32; BANDS], [f32; BANDS]);
+        type Output = ([f32; LANES], [f32; LANES]);
         #[inline(always)]
         fn with_simd<S: Simd>(self, s: S) -> Self::Output {
-            band_spans(s, &self.0, &self.1, 0, BANDS)
+            band_spans(s, &self.0, &self.1, 0)
         }
     }
 
@@ -203,7 +174,7 @@ mod tests {
             let moved = Splat { mean: [splat.mean[0], splat.mean[1] + shift], ..splat };
             let two_tau = 11.0 * r(6);
             let rightmost = (b / a) as f32 * splat.extent[0];
-            let outline = Outline { two_tau: two_tau as f32, rightmost, rows: [0, 4] };
+            let outline = Outline { two_tau: two_tau as f32, rightmost, ..Default::default() };
             let (low, high) = Level::native().dispatch(Band(moved, outline));
             let (lo, hi) = (low[0], high[0]);
             let (mut seen_lo, mut seen_hi) = (f64::MAX, f64::MIN);

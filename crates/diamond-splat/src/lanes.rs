@@ -148,8 +148,7 @@ pub(crate) fn alphas<S: Simd, const N: usize, const M: usize, const SMOOTH: bool
         // Whole rows of a block in a vector: all vectors have the same x.
         let shared = s.mul_add_e_f32s(u_x, at.x[0], u0);
         for i in 0..N {
-            let along_x =
-                if S::F32_LANES.is_multiple_of(BLOCK) { shared } else { s.mul_add_e_f32s(u_x, at.x[i], u0) };
+            let along_x = if S::F32_LANES.is_multiple_of(BLOCK) { shared } else { s.mul_add_e_f32s(u_x, at.x[i], u0) };
             let u = s.mul_add_e_f32s(u_y, at.y[i], along_x);
             let v = s.mul_add_e_f32s(v_y, at.y[i], v0);
             exponents[m][i] = s.negate_mul_add_e_f32s(u, u, s.negate_mul_add_e_f32s(v, v, log2_opacity));

@@ -8,8 +8,7 @@
 //! Everything here is evaluated in f64, once per Gaussian: the inverse of a long thin ellipse loses as many digits as
 //! its condition number has, and 1e-5 of relative error is what gradients are allowed. The determinant is a sum of
 //! squares (Cauchy–Binet), never a difference.
-use crate::bins::{ROW, Rows, Run};
-use crate::ellipse::BLOCK;
+use crate::bins::{Bins, Run, grid};
 use crate::footprint::{Linearised, View};
 use crate::lanes::Level;
 use crate::{Cutoff, Gaussians, RasterConfig, SplatError};
@@ -63,7 +62,9 @@ pub(crate) struct Outline {
     pub two_tau: f32,
     /// y of the rightmost point from the mean, px.
     pub rightmost: f32,
-    /// Rows of pixels (first, one past last) whose centres it can touch.
+    /// Columns of pixels (first, one past last) whose centres it can touch.
+    pub columns: [u32; 2],
+    /// Rows of pixels, likewise.
     pub rows: [u32; 2],
 }
 
@@ -78,7 +79,7 @@ fn pixel_range(mean: f64, extent: f64, size: u32) -> (u32, u32) {
 pub struct Projection {
     pub(crate) camera: Camera,
     pub(crate) config: RasterConfig,
-    pub(crate) rows: Rows,
+    pub(crate) bins: Bins,
     visible: Vec<u32>,
     radii: Vec<f32>,
 }
@@ -108,8 +109,8 @@ impl Projection {
     /// The footprint of a Gaussian, `None` where it is culled.
     pub fn footprint(&self, gaussian: usize) -> Option<Footprint> {
         let k = self.visible.binary_search(&u32::try_from(gaussian).ok()?).ok()?;
-        let run = self.rows.ranges.partition_point(|range| range.end <= k);
-        let s = &self.rows.runs[run].splats[k - self.rows.ranges[run].start];
+        let run = self.bins.ranges.partition_point(|range| range.end <= k);
+        let s = &self.bins.runs[run].splats[k - self.bins.ranges[run].start];
         let [l11, l21, l22] = s.chol;
         Some(Footprint {
             mean: Vec2::new(s.mean[0] as f32, s.mean[1] as f32),
@@ -155,8 +156,9 @@ pub fn project(gaussians: &Gaussians, camera: &Camera, config: &RasterConfig) ->
         radii[s.gaussian as usize] = s.extent[0].max(s.extent[1]);
         visible.push(s.gaussian);
     }
-    let rows = Rows::new(runs, (view.size[1] as usize).div_ceil(ROW));
-    Ok(Projection { camera: *camera, config: *config, rows, visible, radii })
+    let [width, height] = grid(view.size.map(|side| side as usize));
+    let bins = Bins::new(runs, width * height);
+    Ok(Projection { camera: *camera, config: *config, bins, visible, radii })
 }
 
 /// The projection of consecutive Gaussians.
@@ -181,8 +183,7 @@ impl WithSimd for ProjectRun<'_> {
                 outlines.push(outline);
             }
         }
-        let [width, height] = view.size.map(|side| side as usize);
-        Run::new(s, splats, &outlines, height.div_ceil(ROW), width.div_ceil(BLOCK))
+        Run::new(s, splats, &outlines, view.size.map(|side| side as usize))
     }
 }
 
@@ -252,7 +253,12 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
         log2_opacity: log2_opacity as f32,
         extent: [ex as f32, ey as f32],
     };
-    let outline = Outline { two_tau: two_tau as f32, rightmost: (cov[1] / cov[0] * ex) as f32, rows: [y0, y1] };
+    let outline = Outline {
+        two_tau: two_tau as f32,
+        rightmost: (cov[1] / cov[0] * ex) as f32,
+        columns: [x0, x1],
+        rows: [y0, y1],
+    };
     (finite && x0 < x1 && y0 < y1).then_some((splat, outline))
 }
 

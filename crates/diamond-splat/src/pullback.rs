@@ -1,4 +1,4 @@
-//! Backward blending of one row of blocks: the reverse of [`crate::blend`].
+//! Backward blending of one region: the reverse of [`crate::blend`].
 //!
 //! With `e_k = Σ_c f_kc·dC_c + z_k·dD + dO` and `B_k` what the light behind splat k is worth,
 //! `B_{k−1} = α_k e_k + (1 − α_k) B_k`, the gradient of alpha is `T_k (e_k − B_k)` `[eq:splat-blend-pull]`: no division
@@ -8,8 +8,9 @@
 //! the 16 pixels are matrix products with a row per pixel, so no horizontal additions are needed; the geometric
 //! gradient is carried by the six moments `Σ g·(1, x, y, x², xy, y²)` about the block's centre, which are turned into
 //! moments of the whitened offset `Lᵀd` before they are added up: there a long thin splat's do not cancel.
-use crate::bins::{Reached, RowScratch};
-use crate::blend::{Place, Scene, TOGETHER};
+use crate::RasterGrad;
+use crate::bins::{Reached, Scratch};
+use crate::blend::{Scene, TOGETHER};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite, load, store, with_lanes};
 use glam::{Mat4, Vec4};
@@ -50,40 +51,38 @@ fn whiten(at: &[Prepared; GROUP], m: &[[f32; MOMENTS]; GROUP]) -> [[f32; GEOMETR
     to
 }
 
-/// The backward pass of one row.
-pub(crate) struct RowBackward<'a> {
+/// The backward pass of one region.
+pub(crate) struct RegionBackward<'a> {
     pub scene: &'a Scene<'a>,
-    pub row: usize,
+    pub region: usize,
     pub lists: &'a Reached,
-    pub scratch: &'a mut RowScratch,
-    /// Cotangents of the row's pixels.
-    pub d_features: &'a [f32],
-    pub d_opacity: &'a [f32],
-    pub d_depth: &'a [f32],
+    pub scratch: &'a mut Scratch,
+    /// Cotangents of the whole image.
+    pub d: &'a RasterGrad,
 }
 
-impl WithSimd for RowBackward<'_> {
-    /// Slots × ([`GEOMETRY`] + stride): sums of each splat over the pixels of the row.
+impl WithSimd for RegionBackward<'_> {
+    /// Slots × ([`GEOMETRY`] + stride): sums of each splat over the pixels of the region.
     type Output = Vec<f32>;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> Vec<f32> {
         if self.scene.smooth {
-            with_lanes!(s: S, backward_row_smooth(self))
+            with_lanes!(s: S, backward_smooth(self))
         } else {
-            with_lanes!(s: S, backward_row_hard(self))
+            with_lanes!(s: S, backward_hard(self))
         }
     }
 }
 
 #[inline(always)]
-fn backward_row_hard<S: Simd, const N: usize>(s: S, row: RowBackward) -> Vec<f32> {
-    backward_row::<S, N, false>(s, row)
+fn backward_hard<S: Simd, const N: usize>(s: S, region: RegionBackward) -> Vec<f32> {
+    backward::<S, N, false>(s, region)
 }
 
 #[inline(always)]
-fn backward_row_smooth<S: Simd, const N: usize>(s: S, row: RowBackward) -> Vec<f32> {
-    backward_row::<S, N, true>(s, row)
+fn backward_smooth<S: Simd, const N: usize>(s: S, region: RegionBackward) -> Vec<f32> {
+    backward::<S, N, true>(s, region)
 }
 
 /// One splat on one block as the forward pass saw it.
@@ -97,14 +96,14 @@ struct Pair {
 const EMPTY: Pair = Pair { alpha: [0.0; LANES], transmittance: [0.0; LANES], chain: [0.0; LANES] };
 
 #[inline(always)]
-fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackward) -> Vec<f32> {
-    let RowBackward { scene, row, lists, scratch, d_features, d_opacity, d_depth } = row;
+fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBackward) -> Vec<f32> {
+    let RegionBackward { scene, region, lists, scratch, d } = region;
+    let (d_features, d_opacity, d_depth) = (d.features.data(), d.opacity.data(), d.depth.data());
     let (stride, channels) = (scene.stride, scene.channels);
     let line = GEOMETRY + stride;
-    scratch.gather(scene.rows, row, scene.features, stride);
+    scratch.gather(scene.bins, region, scene.features, stride);
     let scratch = &*scratch;
     let mut grad = vec![0.0f32; scratch.slots.len() * line];
-    let mut lists = lists.iter();
     let offsets = Offsets::<S, N>::new();
     // Hidden from the compiler, which would make constants of it and four long chains of additions.
     let basis = std::hint::black_box(moment_basis());
@@ -115,153 +114,151 @@ fn backward_row<S: Simd, const N: usize, const SMOOTH: bool>(s: S, row: RowBackw
     // Cotangents of a block: a row per channel, and a row per pixel.
     let mut by_channel = vec![[0.0f32; LANES]; channels + 1];
     let mut by_pixel = vec![0.0f32; LANES * stride];
-    for block in 0..scene.blocks() {
-        for band in 0..scene.bands(row) {
-            let entries = lists.next().unwrap_or(&[]);
-            let reach = entries.len();
-            if reach == 0 {
-                continue;
-            }
-            let place = Place { row, band, block };
-            let x = scene.centre(place);
-            prepared.clear();
-            for &slot in entries {
-                prepared.push(scratch.prepare(slot, x, band));
-            }
-            let (width, height) = scene.size(place);
-            let mut d_one = [0.0f32; LANES];
-            if width < BLOCK || height < BLOCK {
-                by_pixel.fill(0.0);
-            }
-            for y in 0..height {
-                for x in 0..width {
-                    let (pixel, lane) = (scene.pixel(place, y) + x, y * BLOCK + x);
-                    let to = &mut by_pixel[lane * stride..][..channels + 1];
-                    to[..channels].copy_from_slice(&d_features[pixel * channels..][..channels]);
-                    to[channels] = d_depth[pixel];
-                    d_one[lane] = d_opacity[pixel];
+    for (block, entries) in lists.iter().enumerate() {
+        let reach = entries.len();
+        let Some(place) = scene.place(region, block).filter(|_| reach > 0) else {
+            continue;
+        };
+        let (x, y) = place.centre();
+        prepared.clear();
+        for &slot in entries {
+            prepared.push(scratch.prepare(slot, x, y));
+        }
+        let [width, height] = place.size;
+        let mut d_one = [0.0f32; LANES];
+        if place.size != [BLOCK; 2] {
+            by_pixel.fill(0.0);
+        }
+        for y in 0..height {
+            for x in 0..width {
+                let (pixel, lane) = ((place.y + y) * scene.width + place.x + x, y * BLOCK + x);
+                let to = &mut by_pixel[lane * stride..][..channels + 1];
+                for (to, from) in to.iter_mut().zip(&d_features[pixel * channels..][..channels]) {
+                    *to = *from;
                 }
+                to[channels] = d_depth[pixel];
+                d_one[lane] = d_opacity[pixel];
             }
-            for lane in 0..LANES {
-                for c in 0..=channels {
-                    by_channel[c][lane] = by_pixel[lane * stride + c];
+        }
+        for lane in 0..LANES {
+            for c in 0..=channels {
+                by_channel[c][lane] = by_pixel[lane * stride + c];
+            }
+        }
+        // Front to back: the weights again.
+        let mut t = load::<S, N>(&place.initial_transmittance());
+        let n = reach;
+        prepared.resize(n.next_multiple_of(TOGETHER), Prepared::NOTHING);
+        if pairs.len() < prepared.len() {
+            pairs.resize(prepared.len(), EMPTY);
+        }
+        let groups = prepared.as_chunks::<TOGETHER>().0.iter().zip(pairs.as_chunks_mut::<TOGETHER>().0);
+        for (splats, pairs) in groups {
+            let (a, chains) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
+            for m in 0..TOGETHER {
+                let before = t;
+                let w = composite::<S, N>(s, &a[m], &mut t, &limits);
+                // Lanes that have stopped carry α = T = 0 from here on, so that all their products vanish.
+                let (mut a, mut t_before) = (a[m], before);
+                for i in 0..N {
+                    let counts = s.greater_than_f32s(w[i], zero);
+                    a[i] = s.select_f32s(counts, a[i], zero);
+                    t_before[i] = s.select_f32s(counts, before[i], zero);
                 }
+                store::<S, N>(&mut pairs[m].alpha, a);
+                store::<S, N>(&mut pairs[m].transmittance, t_before);
+                store::<S, N>(&mut pairs[m].chain, chains[m]);
             }
-            // Front to back: the weights again.
-            let mut t = load::<S, N>(&scene.initial_transmittance(place));
-            let n = reach;
-            prepared.resize(n.next_multiple_of(TOGETHER), Prepared::NOTHING);
-            if pairs.len() < prepared.len() {
-                pairs.resize(prepared.len(), EMPTY);
+        }
+        // Back to front.
+        let d_one = load::<S, N>(&d_one);
+        let mut behind = [zero; N];
+        let mut end = n;
+        while end > 0 {
+            let begin = end.saturating_sub(GROUP);
+            // In a short group the last splat stands in for the missing ones, with weights of 0.
+            let mut slots = [0usize; GROUP];
+            let mut rows = [0usize; GROUP];
+            let mut at = [Prepared::default(); GROUP];
+            for m in 0..GROUP {
+                let source = (begin + m).min(end - 1);
+                slots[m] = entries[source] as usize;
+                rows[m] = slots[m] * stride;
+                at[m] = prepared[source];
             }
-            let groups = prepared.as_chunks::<TOGETHER>().0.iter().zip(pairs.as_chunks_mut::<TOGETHER>().0);
-            for (splats, pairs) in groups {
-                let (a, chains) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
-                for m in 0..TOGETHER {
-                    let before = t;
-                    let w = composite::<S, N>(s, &a[m], &mut t, &limits);
-                    // Lanes that have stopped carry α = T = 0 from here on, so that all their products vanish.
-                    let (mut a, mut t_before) = (a[m], before);
-                    for i in 0..N {
-                        let counts = s.greater_than_f32s(w[i], zero);
-                        a[i] = s.select_f32s(counts, a[i], zero);
-                        t_before[i] = s.select_f32s(counts, before[i], zero);
-                    }
-                    store::<S, N>(&mut pairs[m].alpha, a);
-                    store::<S, N>(&mut pairs[m].transmittance, t_before);
-                    store::<S, N>(&mut pairs[m].chain, chains[m]);
-                }
-            }
-            // Back to front.
-            let d_one = load::<S, N>(&d_one);
-            let mut behind = [zero; N];
-            let mut end = n;
-            while end > 0 {
-                let begin = end.saturating_sub(GROUP);
-                // In a short group the last splat stands in for the missing ones, with weights of 0.
-                let mut slots = [0usize; GROUP];
-                let mut rows = [0usize; GROUP];
-                let mut at = [Prepared::default(); GROUP];
+            let mut e = [d_one; GROUP];
+            for c in 0..=channels {
+                let d = load::<S, N>(&by_channel[c]);
                 for m in 0..GROUP {
-                    let source = (begin + m).min(end - 1);
-                    slots[m] = entries[source] as usize;
-                    rows[m] = slots[m] * stride;
-                    at[m] = prepared[source];
-                }
-                let mut e = [d_one; GROUP];
-                for c in 0..=channels {
-                    let d = load::<S, N>(&by_channel[c]);
-                    for m in 0..GROUP {
-                        let f = s.splat_f32s(scratch.features[rows[m] + c]);
-                        for i in 0..N {
-                            e[m][i] = s.mul_add_e_f32s(f, d[i], e[m][i]);
-                        }
-                    }
-                }
-                let mut w = [[0.0f32; LANES]; GROUP];
-                let mut g = [[0.0f32; LANES]; GROUP];
-                for m in (0..end - begin).rev() {
-                    let pair = &pairs[begin + m];
-                    let a = load::<S, N>(&pair.alpha);
-                    let t = load::<S, N>(&pair.transmittance);
-                    let chain = load::<S, N>(&pair.chain);
-                    let mut w_m = a;
-                    let mut g_m = a;
+                    let f = s.splat_f32s(scratch.features[rows[m] + c]);
                     for i in 0..N {
-                        let gain = s.sub_f32s(e[m][i], behind[i]);
-                        w_m[i] = s.mul_f32s(a[i], t[i]);
-                        g_m[i] = s.mul_f32s(s.mul_f32s(t[i], gain), chain[i]);
-                        behind[i] = s.mul_add_e_f32s(a[i], gain, behind[i]);
-                    }
-                    store::<S, N>(&mut w[m], w_m);
-                    store::<S, N>(&mut g[m], g_m);
-                }
-                // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
-                let mut about_centre = [[0.0f32; MOMENTS]; GROUP];
-                let mut c = 0;
-                // The stride is a multiple of both.
-                while c < GEOMETRY.max(S::F32_LANES) {
-                    let right = [&basis.as_flattened()[c..], &by_pixel[c..]];
-                    let [sums, features] = products::<S>(s, [&g, &w], right, [MOMENTS, stride]);
-                    for m in 0..GROUP {
-                        let (to, _) = S::as_mut_simd_f32s(&mut about_centre[m][c..c + S::F32_LANES]);
-                        to[0] = sums[m];
-                        let to = slots[m] * line + GEOMETRY + c;
-                        add::<S>(s, &mut grad[to..to + S::F32_LANES], features[m]);
-                    }
-                    c += S::F32_LANES;
-                }
-                let moments = whiten(&at, &about_centre);
-                for m in 0..GROUP {
-                    let to = &mut grad[slots[m] * line..][..GEOMETRY];
-                    for k in 0..GEOMETRY {
-                        to[k] += moments[m][k];
+                        e[m][i] = s.mul_add_e_f32s(f, d[i], e[m][i]);
                     }
                 }
-                while c < stride {
-                    let two = c + 2 * S::F32_LANES <= stride;
-                    let sums = if two {
-                        product::<S, 2>(s, &w, &by_pixel[c..], stride)
-                    } else {
-                        let one = product::<S, 1>(s, &w, &by_pixel[c..], stride);
-                        let mut sums = [[zero; 2]; GROUP];
-                        for m in 0..GROUP {
-                            sums[m][0] = one[m][0];
-                        }
-                        sums
-                    };
-                    for m in 0..GROUP {
-                        let to = slots[m] * line + GEOMETRY + c;
-                        add::<S>(s, &mut grad[to..to + S::F32_LANES], sums[m][0]);
-                        if two {
-                            let to = to + S::F32_LANES;
-                            add::<S>(s, &mut grad[to..to + S::F32_LANES], sums[m][1]);
-                        }
-                    }
-                    c += if two { 2 } else { 1 } * S::F32_LANES;
-                }
-                end = begin;
             }
+            let mut w = [[0.0f32; LANES]; GROUP];
+            let mut g = [[0.0f32; LANES]; GROUP];
+            for m in (0..end - begin).rev() {
+                let pair = &pairs[begin + m];
+                let a = load::<S, N>(&pair.alpha);
+                let t = load::<S, N>(&pair.transmittance);
+                let chain = load::<S, N>(&pair.chain);
+                let mut w_m = a;
+                let mut g_m = a;
+                for i in 0..N {
+                    let gain = s.sub_f32s(e[m][i], behind[i]);
+                    w_m[i] = s.mul_f32s(a[i], t[i]);
+                    g_m[i] = s.mul_f32s(s.mul_f32s(t[i], gain), chain[i]);
+                    behind[i] = s.mul_add_e_f32s(a[i], gain, behind[i]);
+                }
+                store::<S, N>(&mut w[m], w_m);
+                store::<S, N>(&mut g[m], g_m);
+            }
+            // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
+            let mut about_centre = [[0.0f32; MOMENTS]; GROUP];
+            let mut c = 0;
+            // The stride is a multiple of both.
+            while c < GEOMETRY.max(S::F32_LANES) {
+                let right = [&basis.as_flattened()[c..], &by_pixel[c..]];
+                let [sums, features] = products::<S>(s, [&g, &w], right, [MOMENTS, stride]);
+                for m in 0..GROUP {
+                    let (to, _) = S::as_mut_simd_f32s(&mut about_centre[m][c..c + S::F32_LANES]);
+                    to[0] = sums[m];
+                    let to = slots[m] * line + GEOMETRY + c;
+                    add::<S>(s, &mut grad[to..to + S::F32_LANES], features[m]);
+                }
+                c += S::F32_LANES;
+            }
+            let moments = whiten(&at, &about_centre);
+            for m in 0..GROUP {
+                let to = &mut grad[slots[m] * line..][..GEOMETRY];
+                for k in 0..GEOMETRY {
+                    to[k] += moments[m][k];
+                }
+            }
+            while c < stride {
+                let two = c + 2 * S::F32_LANES <= stride;
+                let sums = if two {
+                    product::<S, 2>(s, &w, &by_pixel[c..], stride)
+                } else {
+                    let one = product::<S, 1>(s, &w, &by_pixel[c..], stride);
+                    let mut sums = [[zero; 2]; GROUP];
+                    for m in 0..GROUP {
+                        sums[m][0] = one[m][0];
+                    }
+                    sums
+                };
+                for m in 0..GROUP {
+                    let to = slots[m] * line + GEOMETRY + c;
+                    add::<S>(s, &mut grad[to..to + S::F32_LANES], sums[m][0]);
+                    if two {
+                        let to = to + S::F32_LANES;
+                        add::<S>(s, &mut grad[to..to + S::F32_LANES], sums[m][1]);
+                    }
+                }
+                c += if two { 2 } else { 1 } * S::F32_LANES;
+            }
+            end = begin;
         }
     }
     grad

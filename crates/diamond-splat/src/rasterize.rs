@@ -1,11 +1,11 @@
 //! The rasteriser's front: `rasterize`, what it returns, and the pullback that belongs to it.
-use crate::bins::{ROW, Reached, RowScratch};
-use crate::blend::{RowForward, RowWork, Scene};
+use crate::bins::{REGION, Reached, Scratch};
+use crate::blend::{RegionForward, RegionImage, Scene};
 use crate::ellipse::KAPPA2;
 use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::{Level, Thresholds};
 use crate::projection::{CHUNK, is_smooth, project};
-use crate::pullback::{GEOMETRY, RowBackward};
+use crate::pullback::{GEOMETRY, RegionBackward};
 use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -149,41 +149,62 @@ fn blend<'a>(
     }
     let k = &projection.camera.intrinsics;
     let (width, height) = (k.width as usize, k.height as usize);
+    let scene = scene(&projection, features, level);
+    let regions: Vec<RegionImage> = (0..projection.bins.regions)
+        .into_par_iter()
+        .map(|region| with_scratch(|scratch| level.dispatch(RegionForward { scene: &scene, region, scratch })))
+        .collect();
     let mut raster = Raster {
         features: Image::new(width, height, channels),
         opacity: Image::new(width, height, 1),
         depth: Image::new(width, height, 1),
         stats: RasterStats { visible: projection.visible().len(), ..Default::default() },
     };
-    let scene = scene(&projection, features, level);
-    let band = width * ROW;
-    // Zero channels: every row gets an empty piece.
-    let mut feature_rows: Vec<&mut [f32]> = if channels == 0 {
-        (0..projection.rows.len()).map(|_| Default::default()).collect()
-    } else {
-        raster.features.data_mut().chunks_mut(band * channels).collect()
-    };
-    let (lists, works): (Vec<Reached>, Vec<RowWork>) = feature_rows
-        .par_iter_mut()
-        .zip(raster.opacity.data_mut().par_chunks_mut(band))
-        .zip(raster.depth.data_mut().par_chunks_mut(band))
-        .enumerate()
-        .map(|(row, ((features, opacity), depth))| {
-            with_scratch(|scratch| {
-                level.dispatch(RowForward { scene: &scene, row, scratch, features, opacity, depth })
-            })
-        })
-        .unzip();
-    raster.stats.block_entries = works.iter().map(|w| w.entries).sum();
-    raster.stats.evaluated_pairs = works.iter().map(|w| w.evaluated).sum();
-    raster.stats.blended_pairs = projection.config.count_blended.then(|| works.iter().map(|w| w.blended).sum());
+    assemble(&mut raster, &scene, &regions);
+    let work = regions.iter().map(|region| region.work);
+    raster.stats.block_entries = work.clone().map(|w| w.entries).sum();
+    raster.stats.evaluated_pairs = work.clone().map(|w| w.evaluated).sum();
+    raster.stats.blended_pairs = projection.config.count_blended.then(|| work.map(|w| w.blended).sum());
+    let lists = regions.into_iter().map(|region| region.lists).collect();
     Ok((raster, RasterPullback { gaussians, features, projection, lists, level }))
 }
 
+/// Copies the regions into the images.
+fn assemble(raster: &mut Raster, scene: &Scene, regions: &[RegionImage]) {
+    let (width, channels) = (scene.width, scene.channels);
+    let columns = width.div_ceil(REGION[0]);
+    let band = width * REGION[1];
+    // Zero channels: every band gets an empty piece.
+    let mut features: Vec<&mut [f32]> = raster.features.data_mut().chunks_mut((band * channels).max(1)).collect();
+    features.resize_with(scene.height.div_ceil(REGION[1]), Default::default);
+    (features, raster.opacity.data_mut().par_chunks_mut(band), raster.depth.data_mut().par_chunks_mut(band))
+        .into_par_iter()
+        .enumerate()
+        .for_each(|(y, (features, opacity, depth))| {
+            for x in 0..columns {
+                let region = y * columns + x;
+                let data = &regions[region].data;
+                if data.is_empty() {
+                    continue;
+                }
+                let [w, h] = scene.region_size(region);
+                let (from_features, rest) = data.split_at(w * h * channels);
+                let (from_opacity, from_depth) = rest.split_at(w * h);
+                for line in 0..h {
+                    let (to, from) = (line * width + x * REGION[0], line * w);
+                    features[to * channels..(to + w) * channels]
+                        .copy_from_slice(&from_features[from * channels..(from + w) * channels]);
+                    opacity[to..to + w].copy_from_slice(&from_opacity[from..from + w]);
+                    depth[to..to + w].copy_from_slice(&from_depth[from..from + w]);
+                }
+            }
+        });
+}
+
 /// Runs `f` with the buffers of this thread.
-fn with_scratch<T>(f: impl FnOnce(&mut RowScratch) -> T) -> T {
+fn with_scratch<T>(f: impl FnOnce(&mut Scratch) -> T) -> T {
     thread_local! {
-        static SCRATCH: RefCell<RowScratch> = RefCell::default();
+        static SCRATCH: RefCell<Scratch> = RefCell::default();
     }
     SCRATCH.with_borrow_mut(f)
 }
@@ -192,7 +213,7 @@ fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
-        rows: &projection.rows,
+        bins: &projection.bins,
         features,
         stride: stride(features.channels, level),
         channels: features.channels,
@@ -208,7 +229,7 @@ fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -
     }
 }
 
-/// Values per splat in a row's copy of the features.
+/// Values per splat in a region's copy of the features.
 fn stride(channels: usize, level: Level) -> usize {
     (channels + 1).next_multiple_of(level.width().max(GEOMETRY))
 }
@@ -229,36 +250,24 @@ impl RasterPullback<'_> {
         check(&d.features, (width, height, self.features.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
         check(&d.depth, (width, height, 1), "RasterGrad::depth")?;
-        let channels = self.features.channels;
         let scene = scene(&self.projection, self.features, self.level);
         let parts: Vec<Vec<f32>> = self
             .lists
             .par_iter()
             .enumerate()
-            .map(|(row, lists)| {
-                let pixels = row * ROW * width..height.min((row + 1) * ROW) * width;
-                with_scratch(|scratch| {
-                    self.level.dispatch(RowBackward {
-                        scene: &scene,
-                        row,
-                        lists,
-                        scratch,
-                        d_features: &d.features.data()[pixels.start * channels..pixels.end * channels],
-                        d_opacity: &d.opacity.data()[pixels.clone()],
-                        d_depth: &d.depth.data()[pixels],
-                    })
-                })
+            .map(|(region, lists)| {
+                with_scratch(|scratch| self.level.dispatch(RegionBackward { scene: &scene, region, lists, scratch, d }))
             })
             .collect();
         Ok(self.gather(&parts))
     }
 
-    /// Sums the rows' contributions per splat, in order of rows, and pulls them through the projection.
+    /// Sums the regions' contributions per splat, in order of regions, and pulls them through the projection.
     fn gather(&self, parts: &[Vec<f32>]) -> RasterPull {
         let n = self.gaussians.len();
         let channels = self.features.channels;
         let line = GEOMETRY + stride(channels, self.level);
-        let rows = &self.projection.rows;
+        let bins = &self.projection.bins;
         let view = View::new(&self.projection.camera);
         let mut g = GaussiansGrad::zeros(n);
         let mut screen = vec![Vec2::ZERO; n];
@@ -276,10 +285,10 @@ impl RasterPullback<'_> {
             .into_par_iter()
             .enumerate()
             .for_each(|(run, (means, scales, rotations, opacities, screen, d_features))| {
-                let splats = &rows.runs[run].splats;
+                let splats = &bins.runs[run].splats;
                 let mut sums = vec![0.0f32; splats.len() * line];
-                rows.for_each_place(run, |splat, row, slot| {
-                    let from = &parts[row][slot * line..][..line];
+                bins.for_each_place(run, |splat, region, slot| {
+                    let from = &parts[region][slot * line..][..line];
                     sums[splat * line..][..line].iter_mut().zip(from).for_each(|(a, b)| *a += b);
                 });
                 for (splat, sums) in splats.iter().zip(sums.chunks_exact(line)) {
