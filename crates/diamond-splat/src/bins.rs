@@ -12,8 +12,8 @@ use std::ops::Range;
 
 /// Blocks of a region side by side. At most 16: a span is two numbers of four bits.
 pub(crate) const COLUMNS: usize = 16;
-/// Blocks of a region one below the other, that is bands.
-pub(crate) const ROWS: usize = 8;
+/// Blocks of a region one below the other.
+pub(crate) const ROWS: usize = BANDS;
 /// Width and height of a region, pixels.
 pub(crate) const REGION: [usize; 2] = [COLUMNS * BLOCK, ROWS * BLOCK];
 
@@ -94,16 +94,16 @@ impl Run {
             let columns = of(outline.columns, REGION[0]);
             for y in of(outline.rows, REGION[1]) {
                 let mut spans = [(0, 0); ROWS];
-                let mut band = 0;
-                while band < ROWS {
-                    let (low, high) = band_spans(s, splat, outline, y * ROWS + band);
-                    for k in 0..BANDS {
-                        spans[band + k] = block_span(low[k], high[k], blocks);
-                    }
-                    band += BANDS;
+                // The bands that it meets.
+                let first = (outline.rows[0] as usize / BLOCK).saturating_sub(y * ROWS);
+                let past = ((outline.rows[1] as usize).div_ceil(BLOCK) - y * ROWS).min(ROWS);
+                let (low, high) = band_spans(s, splat, outline, y * ROWS);
+                for band in first..past {
+                    spans[band] = block_span(low[band], high[band], blocks);
                 }
                 for x in columns.clone() {
-                    for band in 0..ROWS {
+                    slot.spans = [Span::NONE; ROWS];
+                    for band in first..past {
                         slot.spans[band] = Span::new(spans[band], x * COLUMNS);
                     }
                     if slot.spans == [Span::NONE; ROWS] {
@@ -123,7 +123,8 @@ impl Run {
             total += *start;
             *start = total;
         }
-        run.slots = by_splat.clone();
+        let nothing = Slot { ellipse: Ellipse::default(), gaussian: 0, depth: 0.0, spans: [Span::NONE; ROWS] };
+        run.slots = vec![nothing; by_splat.len()];
         for (slot, &(region, place)) in by_splat.iter().zip(&run.places) {
             run.slots[(run.region_start[region as usize] + place) as usize] = *slot;
         }

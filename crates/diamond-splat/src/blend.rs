@@ -228,7 +228,9 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
             reach = batch * BATCH + n;
             if !any_positive::<S, N>(s, &t) {
                 // The last that any pixel saw.
-                while n > 0 && weights[reach - batch * BATCH - 1] == [0.0; LANES] && reach > batch * BATCH + 1 {
+                while reach > batch * BATCH + 1
+                    && !any_positive::<S, N>(s, &load::<S, N>(&weights[reach - batch * BATCH - 1]))
+                {
                     reach -= 1;
                 }
                 break;
