@@ -26,6 +26,7 @@ pub fn raster_config(model: &Model) -> RasterConfig {
         min_transmittance: s.min_transmittance,
         near: (s.near * model.scene.camera_distance).max(1e-5),
         cutoff: Cutoff::Hard,
+        ..RasterConfig::default()
     }
 }
 
