@@ -6,11 +6,15 @@ use std::process::ExitCode;
 use xtask::oracle::{self, OracleKind};
 use xtask::{fixtures, suite, tidy};
 
+/// The benchmarks that exist: targets of this package, compiled with optimisation.
+const BENCHES: [&str; 1] = ["splat"];
+
 const EXAMPLES: &str = "\
 Examples:
   cargo xtask test                                  everything that must pass before a commit
   cargo xtask oracle ggx assets/fixtures/ggx        our microfacet terms against a table
   cargo xtask oracle splat scenes/dense_1000.npz    one splat scene
+  cargo xtask bench splat                           time and error of the rasteriser
   cargo xtask tidy --rules                          the house rules and their reasons
   cargo xtask fixtures --update                     accept the reference files as they are now
 
@@ -44,6 +48,15 @@ enum Tool {
         /// The long tests too.
         #[arg(long)]
         full: bool,
+    },
+    /// Measure run time and error: `cargo xtask bench splat`.
+    Bench {
+        /// What to measure.
+        #[arg(value_parser = BENCHES)]
+        name: String,
+        /// Passed on; `cargo xtask bench splat -- --help` lists what there is.
+        #[arg(last = true)]
+        rest: Vec<String>,
     },
     /// Compare reference files and captures with their manifest of hashes.
     Fixtures {
@@ -90,6 +103,10 @@ fn run(tool: Tool) -> Result<bool, String> {
             Ok(errors == 0)
         }
         Tool::Test { full } => suite::run(root, full),
+        Tool::Bench { name, rest } => {
+            let arguments = ["bench", "--quiet", "--package", "xtask", "--bench", &name, "--"];
+            suite::cargo(root, &arguments.into_iter().chain(rest.iter().map(String::as_str)).collect::<Vec<_>>())
+        }
         Tool::Fixtures { update: true, .. } => {
             let count = fixtures::update(root)?;
             println!("{}: {count} files", fixtures::MANIFEST);

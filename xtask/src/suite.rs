@@ -36,7 +36,11 @@ fn timed(what: &str, action: impl FnOnce() -> Result<bool, String>) -> Result<bo
     Ok(passed)
 }
 
-fn cargo(root: &Path, arguments: &[&str]) -> Result<bool, String> {
+/// Runs cargo in `root` with its output passed through; whether it succeeded.
+///
+/// # Errors
+/// When it cannot be started.
+pub fn cargo(root: &Path, arguments: &[&str]) -> Result<bool, String> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let status = Command::new(program).args(arguments).current_dir(root).status();
     status.map(|status| status.success()).map_err(|e| format!("cargo {}: {e}", arguments.join(" ")))

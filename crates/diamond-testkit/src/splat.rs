@@ -98,6 +98,60 @@ pub fn splat_alpha<R: Real>(conic: &[R; 3], opacity: R, offset: [R; 2], rules: &
     clamped * t * t * (of(3.0) - of(2.0) * t)
 }
 
+/// One projected Gaussian: its index, screen mean (px), conic (1/px²) and view-space z.
+pub type ProjectedSplat<R> = (usize, [R; 2], [R; 3], R);
+
+/// The Gaussians of `parameters` (`stride` numbers each) that are in front of the camera, nearest first.
+pub fn sorted_splats<R: Real>(
+    parameters: &[R],
+    stride: usize,
+    camera: &SplatCamera,
+    rules: &SplatRules,
+) -> Vec<ProjectedSplat<R>> {
+    let mut splats: Vec<_> = parameters
+        .chunks_exact(stride)
+        .enumerate()
+        .filter_map(|(i, g)| project_splat(g, camera, rules).map(|(mean, conic, z)| (i, mean, conic, z)))
+        .collect();
+    // Stable, so that ties stay in the order of their indices.
+    splats.sort_by(|a, b| a.3.value().total_cmp(&b.3.value()));
+    splats
+}
+
+/// Features, opacity and depth of the pixel whose centre is at `centre` (px) `[eq:splat-blend]`.
+pub fn splat_pixel<'a, R: Real + 'a>(
+    splats: impl IntoIterator<Item = &'a ProjectedSplat<R>>,
+    parameters: &[R],
+    channels: usize,
+    centre: [f64; 2],
+    rules: &SplatRules,
+) -> Vec<R> {
+    let of = R::of;
+    let stride = SPLAT_PARAMETERS + channels;
+    let mut pixel = vec![of(0.0); channels + 2];
+    let mut transmittance = of(1.0);
+    for (i, mean, conic, z) in splats {
+        let g = &parameters[i * stride..(i + 1) * stride];
+        let offset = [of(centre[0]) - mean[0], of(centre[1]) - mean[1]];
+        let alpha = splat_alpha(conic, g[10], offset, rules);
+        if alpha.value() <= 0.0 {
+            continue;
+        }
+        let next = transmittance * (of(1.0) - alpha);
+        if !rules.smooth && next.value() <= rules.min_transmittance {
+            break;
+        }
+        let weight = transmittance * alpha;
+        for c in 0..channels {
+            pixel[c] += weight * g[SPLAT_PARAMETERS + c];
+        }
+        pixel[channels] += weight;
+        pixel[channels + 1] += weight * *z;
+        transmittance = next;
+    }
+    pixel
+}
+
 /// Renders `n` Gaussians of `SPLAT_PARAMETERS + channels` numbers each; gives, per pixel, the features, then the opacity,
 /// then the depth `[eq:splat-blend]`.
 pub fn rasterize_splats<R: Real>(
@@ -106,39 +160,11 @@ pub fn rasterize_splats<R: Real>(
     camera: &SplatCamera,
     rules: &SplatRules,
 ) -> Vec<R> {
-    let of = R::of;
-    let stride = SPLAT_PARAMETERS + channels;
-    let mut splats: Vec<_> = parameters
-        .chunks_exact(stride)
-        .enumerate()
-        .filter_map(|(i, g)| project_splat(g, camera, rules).map(|p| (i, p, g)))
-        .collect();
-    // Stable, so that ties stay in the order of their indices.
-    splats.sort_by(|a, b| a.1.2.value().total_cmp(&b.1.2.value()));
+    let splats = sorted_splats(parameters, SPLAT_PARAMETERS + channels, camera, rules);
     let mut out = Vec::with_capacity(camera.size[0] * camera.size[1] * (channels + 2));
     for y in 0..camera.size[1] {
         for x in 0..camera.size[0] {
-            let mut pixel = vec![of(0.0); channels + 2];
-            let mut transmittance = of(1.0);
-            for (_, (mean, conic, z), g) in &splats {
-                let offset = [of(x as f64 + 0.5) - mean[0], of(y as f64 + 0.5) - mean[1]];
-                let alpha = splat_alpha(conic, g[10], offset, rules);
-                if alpha.value() <= 0.0 {
-                    continue;
-                }
-                let next = transmittance * (of(1.0) - alpha);
-                if !rules.smooth && next.value() <= rules.min_transmittance {
-                    break;
-                }
-                let weight = transmittance * alpha;
-                for c in 0..channels {
-                    pixel[c] += weight * g[SPLAT_PARAMETERS + c];
-                }
-                pixel[channels] += weight;
-                pixel[channels + 1] += weight * *z;
-                transmittance = next;
-            }
-            out.extend(pixel);
+            out.extend(splat_pixel(&splats, parameters, channels, [x as f64 + 0.5, y as f64 + 0.5], rules));
         }
     }
     out
