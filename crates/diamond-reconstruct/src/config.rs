@@ -31,6 +31,8 @@ pub struct Config {
     pub input: Input,
     /// How the Gaussians begin.
     pub initial: Initial,
+    /// What a Gaussian is made of.
+    pub model: ModelForm,
     /// The rasteriser's constants.
     pub splat: Splat,
     /// Adam and its learning rates.
@@ -130,6 +132,25 @@ pub struct Initial {
     pub flatness: f32,
 }
 
+/// Form in which covariances are optimised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Covariance {
+    /// Three standard deviations and a quaternion.
+    #[default]
+    RotationScale,
+    /// A lower triangular factor: Σ = L Lᵀ, six numbers.
+    Cholesky,
+}
+
+/// What a Gaussian is made of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelForm {
+    /// Form of the covariance.
+    pub covariance: Covariance,
+}
+
 /// The rasteriser's constants.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -144,6 +165,9 @@ pub struct Splat {
     pub min_transmittance: f32,
     /// Near plane as a fraction of the smallest distance from a camera to the scene's centre.
     pub near: f32,
+    /// Smallest standard deviation of a Gaussian as a fraction of the scene's extent: below about 1e-6 it is a point
+    /// whose conic loses all digits. With `max_scale` it bounds the eigenvalues of the covariance in either form.
+    pub min_scale: f32,
     /// Largest standard deviation of a Gaussian as a fraction of the scene's extent.
     pub max_scale: f32,
 }
@@ -162,6 +186,8 @@ pub struct Rates {
     pub scale: f32,
     /// Rotation.
     pub rotation: f32,
+    /// What lies below the diagonal of a lower factor, over the factor's size.
+    pub shear: f32,
     /// Opacity logit.
     pub opacity: f32,
     /// Normal.
@@ -342,12 +368,24 @@ pub struct Loss {
     pub lpips: f32,
 }
 
+/// How Gaussians are added, removed and moved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DensityStrategy {
+    /// Clone, split and prune by screen-space gradient, size and opacity; reset opacities.
+    Adaptive,
+    /// Relocate transparent Gaussians onto opaque ones, grow by a share per round, add noise to the means.
+    Mcmc,
+    /// The first Gaussians are the last.
+    None,
+}
+
 /// Density control.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Density {
-    /// Whether Gaussians are added and removed.
-    pub enabled: bool,
+    /// Which kind.
+    pub strategy: DensityStrategy,
     /// Steps between two rounds.
     pub every_steps: u64,
     /// First round, fraction of the run.
@@ -358,14 +396,45 @@ pub struct Density {
     pub gradient_threshold: f32,
     /// Largest scale (× extent) that is cloned rather than split.
     pub percent_dense: f32,
-    /// Opacity below which a Gaussian is pruned.
+    /// The two children of a split have their parent's scale divided by this.
+    pub split_divisor: f32,
+    /// Opacity below which a Gaussian is pruned, or relocated.
     pub prune_opacity: f32,
+    /// Gaussians whose footprint had a larger radius than this (px) since the last round are pruned; 0 for never.
+    pub max_screen_radius: f32,
+    /// Gaussians with a larger standard deviation than this (× extent) are pruned unless a split helps; 0 for never.
+    pub max_world_scale: f32,
+    /// Fraction of the run from which too large Gaussians are pruned.
+    pub large_from: f32,
     /// Opacity is reset every this fraction of the run; 0 for never.
     pub reset_every: f32,
     /// Opacity after a reset.
     pub reset_opacity: f32,
-    /// Never more Gaussians than this.
+    /// Never more Gaussians than this, the first ones included. Where room is short the largest gradients win.
     pub max_gaussians: usize,
+    /// From this fraction of the run the number of Gaussians stays what it is: nothing is cloned, split, pruned, added or
+    /// reset; relocation goes on. 0 for the whole run, 1 for never.
+    pub freeze_count: f32,
+    /// What relocation needs to know.
+    pub mcmc: Mcmc,
+}
+
+/// Relocation, noise and pressure of the `mcmc` strategy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Mcmc {
+    /// Share of the Gaussians that is added in each round, until `max_gaussians`.
+    pub growth: f32,
+    /// Noise on the means, over the learning rate and × Σ/extent².
+    pub noise: f32,
+    /// Steepness of the gate that spares opaque Gaussians from noise.
+    pub noise_sharpness: f32,
+    /// Opacity at which the gate is half open.
+    pub noise_opacity: f32,
+    /// Weight of the mean opacity in the objective.
+    pub opacity_weight: f32,
+    /// Weight of the mean sum of standard deviations over extent in the objective.
+    pub scale_weight: f32,
 }
 
 fn preset_text(name: &str) -> Option<&'static str> {
@@ -440,6 +509,11 @@ impl Config {
         Ok(config)
     }
 
+    /// At most this many Gaussians at the start: `initial.count`, but never more than `density.max_gaussians`.
+    pub fn initial_count(&self) -> usize {
+        self.initial.count.min(self.density.max_gaussians)
+    }
+
     /// The configuration as TOML text, complete.
     pub fn to_toml(&self) -> Result<String, ReconstructError> {
         toml::to_string_pretty(self)
@@ -454,14 +528,23 @@ impl Config {
             ("accumulate", self.accumulate as f32),
             ("checkpoint_steps", self.checkpoint_steps as f32),
             ("initial.count", self.initial.count as f32),
+            ("splat.min_scale", self.splat.min_scale),
             ("splat.max_scale", self.splat.max_scale),
             ("density.every_steps", self.density.every_steps as f32),
+            ("density.split_divisor", self.density.split_divisor),
+            ("density.max_gaussians", self.density.max_gaussians as f32),
             ("visibility.every_steps", self.visibility.every_steps as f32),
         ];
         for (key, value) in positive {
             if value.is_nan() || value <= 0.0 {
                 return fail(format!("`{key}` must be greater than 0, found {value}"));
             }
+        }
+        if self.splat.min_scale > self.splat.max_scale {
+            return fail(format!(
+                "`splat.min_scale` must not exceed `splat.max_scale`, found {} and {}",
+                self.splat.min_scale, self.splat.max_scale
+            ));
         }
         let unit = [
             ("initial.opacity", self.initial.opacity),
@@ -471,6 +554,11 @@ impl Config {
             ("density.from", self.density.from),
             ("density.until", self.density.until),
             ("density.reset_every", self.density.reset_every),
+            ("density.reset_opacity", self.density.reset_opacity),
+            ("density.large_from", self.density.large_from),
+            ("density.freeze_count", self.density.freeze_count),
+            ("density.mcmc.growth", self.density.mcmc.growth),
+            ("density.mcmc.noise_opacity", self.density.mcmc.noise_opacity),
             ("shading.roughness_unfreeze", self.shading.roughness_unfreeze),
             ("rates.mean_decay", self.rates.mean_decay),
             ("loss.ssim", self.loss.ssim),
@@ -489,6 +577,22 @@ impl Config {
         if self.residual.transfer_degree > 3 {
             let found = self.residual.transfer_degree;
             return fail(format!("`residual.transfer_degree` must be at most 3, found {found}"));
+        }
+        let d = &self.density;
+        let not_negative = [
+            ("density.gradient_threshold", d.gradient_threshold),
+            ("density.percent_dense", d.percent_dense),
+            ("density.max_screen_radius", d.max_screen_radius),
+            ("density.max_world_scale", d.max_world_scale),
+            ("density.mcmc.noise", d.mcmc.noise),
+            ("density.mcmc.noise_sharpness", d.mcmc.noise_sharpness),
+            ("density.mcmc.opacity_weight", d.mcmc.opacity_weight),
+            ("density.mcmc.scale_weight", d.mcmc.scale_weight),
+        ];
+        for (key, value) in not_negative {
+            if !value.is_finite() || value < 0.0 {
+                return fail(format!("`{key}` must be finite and not negative, found {value}"));
+            }
         }
         let losses = [
             ("l2", self.loss.l2),
@@ -509,6 +613,7 @@ impl Config {
             ("mean_final", r.mean_final),
             ("scale", r.scale),
             ("rotation", r.rotation),
+            ("shear", r.shear),
             ("opacity", r.opacity),
             ("normal", r.normal),
             ("material", r.material),

@@ -1,29 +1,26 @@
 //! The CPU engine: one training step, written out in order.
 //!
 //! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
-use crate::forward;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
-    Activated, ActivatedGrad, Attribute, Engine, GaussianParameters, Model, ReconstructError, Rendering, StepPlan,
-    StepReport, TensorFile, TrainingPair, adam, error, logit,
+    Activated, ActivatedGrad, Attribute, DensityStrategy, Engine, GaussianParameters, Layout, Model, ReconstructError,
+    Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
 };
+use crate::{forward, mcmc};
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
 use diamond_splat::GaussiansGrad;
-use diamond_splat::density::{self, DensityConfig, DensityStats, OriginKind, split_child};
+use diamond_splat::density::DensityStats;
 use std::path::Path;
 use std::time::Instant;
 
-/// Smallest standard deviation, × scene extent: below this a Gaussian is a point and its conic loses all digits.
-const MIN_SCALE: f32 = 1e-6;
-
 /// The training step and renderer on the CPU.
 pub struct CpuEngine {
-    model: Model,
-    visibility: VisibilityCache,
-    stats: DensityStats,
+    pub(crate) model: Model,
+    pub(crate) visibility: VisibilityCache,
+    pub(crate) stats: DensityStats,
     profile: Profile,
 }
 
@@ -88,6 +85,7 @@ impl CpuEngine {
                 Attribute::Mean => plan.mean_rate * extent,
                 Attribute::Scale => rates.scale * factor,
                 Attribute::Rotation => rates.rotation * factor,
+                Attribute::Shear => rates.shear * factor,
                 Attribute::Opacity => rates.opacity * factor,
                 Attribute::Normal => rates.normal * factor,
                 Attribute::Roughness if frozen => 0.0,
@@ -100,9 +98,15 @@ impl CpuEngine {
             },
             step + 1,
         );
-        let low = (MIN_SCALE * extent).ln();
-        let high = (self.model.config.splat.max_scale * extent).ln();
-        self.model.parameters.values_mut(Attribute::Scale).iter_mut().for_each(|s| *s = s.clamp(low, high));
+        if self.model.config.density.strategy == DensityStrategy::Mcmc {
+            let mut random = Random::new(self.model.config.seed, Purpose::Noise, step);
+            let settings = &self.model.config.density.mcmc;
+            let g = &activated.gaussians;
+            mcmc::disturb(&mut self.model.parameters, g, settings, plan.mean_rate, extent, &mut random);
+        }
+        let splat = &self.model.config.splat;
+        let (low, high) = (splat.min_scale * extent, splat.max_scale * extent);
+        self.model.parameters.clamp_covariances(low, high);
         if let Some(model_network) = &mut self.model.network {
             let parts = crate::model::network_parts_mut(model_network);
             for (((name, values), moments), gradient) in
@@ -126,52 +130,6 @@ impl CpuEngine {
             });
         }
         Ok(())
-    }
-
-    /// Clones, splits and prunes; returns how many of each.
-    fn densify(&mut self, step: u64) -> Result<[usize; 3], ReconstructError> {
-        let d = &self.model.config.density;
-        let config = DensityConfig {
-            gradient_threshold: d.gradient_threshold,
-            percent_dense: d.percent_dense,
-            prune_opacity: d.prune_opacity,
-            max_gaussians: Some(d.max_gaussians),
-            ..Default::default()
-        };
-        let extent = self.model.scene.extent;
-        let activated = self.model.parameters.activate();
-        let g = &activated.gaussians;
-        let plan = density::plan(g, &self.stats, &config, extent).map_err(error::stage("density control"))?;
-        if plan.origins.is_empty() {
-            // Everything would be pruned (an all-black capture, say): keep the set rather than end with nothing.
-            self.stats = DensityStats::new(self.model.len());
-            return Ok([0, 0, 0]);
-        }
-        let sources: Vec<(u32, bool)> = plan.origins.iter().map(|o| (o.source, o.kind == OriginKind::Kept)).collect();
-        let mut parameters = self.model.parameters.gather(&sources);
-        let mut random = Random::new(self.model.config.seed, Purpose::Split, step);
-        for (i, origin) in plan.origins.iter().enumerate() {
-            if origin.kind == OriginKind::SplitChild {
-                let s = origin.source as usize;
-                let (mean, scale) =
-                    split_child(g.means[s], g.scales[s], g.rotations[s], random.normal3(), config.split_divisor);
-                parameters.values_mut(Attribute::Mean)[3 * i..3 * i + 3].copy_from_slice(&mean.to_array());
-                let log = [scale.x.ln(), scale.y.ln(), scale.z.ln()];
-                parameters.values_mut(Attribute::Scale)[3 * i..3 * i + 3].copy_from_slice(&log);
-            }
-        }
-        self.model.parameters = parameters;
-        self.visibility.gather(&sources);
-        self.stats = DensityStats::new(self.model.len());
-        Ok([plan.cloned, plan.split, plan.pruned])
-    }
-
-    fn reset_opacity(&mut self) {
-        let ceiling = logit(self.model.config.density.reset_opacity);
-        let group = self.model.parameters.group_mut(Attribute::Opacity);
-        group.values.iter_mut().for_each(|v| *v = v.min(ceiling));
-        group.moments.first.fill(0.0);
-        group.moments.second.fill(0.0);
     }
 }
 
@@ -261,6 +219,7 @@ impl Engine for CpuEngine {
             }
         }
         objective::regularise(&self.model, &mut total, &mut terms);
+        mcmc::regularise(&self.model, &activated.gaussians, &mut total, &mut terms);
         let objective_value = terms.objective();
         if !objective_value.is_finite() {
             let culprit = terms.values.iter().find(|t| !t.value.is_finite());
@@ -273,13 +232,7 @@ impl Engine for CpuEngine {
         let t = Instant::now();
         self.apply(step, plan, &activated, &total, &network_grad)?;
         let t = self.profile.add("adam", t);
-        let mut density = [0; 3];
-        if plan.densify {
-            density = self.densify(step)?;
-        }
-        if plan.reset_opacity {
-            self.reset_opacity();
-        }
+        let density = self.control_density(step, plan)?;
         self.profile.add("density control", t);
         Ok(StepReport {
             step,
@@ -332,9 +285,7 @@ impl Engine for CpuEngine {
 
     fn restore(&mut self, path: &Path, mut state: TensorFile) -> Result<(), ReconstructError> {
         let n: usize = state.metadata_value(path, "gaussians")?;
-        let config = &self.model.config;
-        let transfer = config.residual.transfer_width();
-        let mut parameters = crate::GaussianParameters::zeros(n, transfer, config.residual.codes);
+        let mut parameters = GaussianParameters::zeros(n, &Layout::of(&self.model.config));
         for attribute in Attribute::ALL {
             let group = parameters.group_mut(attribute);
             let (name, size) = (attribute.name(), n * group.width);
@@ -384,10 +335,12 @@ impl Engine for CpuEngine {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Covariance;
 
     #[test]
     fn a_nan_in_a_gradient_is_found_and_named() {
-        let parameters = GaussianParameters::zeros(4, 3, 0);
+        let parameters =
+            GaussianParameters::zeros(4, &Layout { covariance: Covariance::RotationScale, transfer: 3, codes: 0 });
         let mut gradients: Vec<Vec<f32>> = parameters.groups().iter().map(|g| vec![0.0; g.values.len()]).collect();
         assert!(check_gradients(&parameters, &gradients, 7).is_ok());
         gradients[Attribute::Normal as usize][7] = f32::NAN;

@@ -37,7 +37,7 @@ pub struct StepReport {
     pub gaussians: usize,
     /// Gaussians that could contribute to the last view.
     pub visible: usize,
-    /// Gaussians cloned, split and pruned after this step.
+    /// Gaussians cloned, split and pruned after this step; with relocation: added, none, and moved.
     pub density: [usize; 3],
 }
 

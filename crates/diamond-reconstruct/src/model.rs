@@ -4,8 +4,8 @@ use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::tensor_file::write_atomically;
 use crate::{
-    Attribute, Config, GaussianParameters, InitialNormals, ReconstructError, Rendering, Scene, TensorFile, error,
-    forward, logit,
+    Attribute, Config, Covariance, GaussianParameters, InitialNormals, Layout, ReconstructError, Rendering, Scene,
+    TensorFile, error, forward, logit,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
@@ -52,7 +52,7 @@ impl Model {
     /// The model before the first step.
     pub fn initial(config: &Config, scene: Scene, points: &InitialPoints) -> Result<Self, ReconstructError> {
         let n = points.positions.len();
-        let mut parameters = GaussianParameters::zeros(n, config.residual.transfer_width(), config.residual.codes);
+        let mut parameters = GaussianParameters::zeros(n, &Layout::of(config));
         let mut random = Random::new(config.seed, Purpose::Initial, 1);
         let distances = mean_squared_distance_to_nearest(&points.positions, 3);
         for i in 0..n {
@@ -71,11 +71,10 @@ impl Model {
                 parameters.values_mut(a)[i * w..(i + 1) * w].copy_from_slice(v);
             };
             set(Attribute::Mean, &p.to_array());
-            let thin = (width * config.initial.flatness.max(1e-3)).ln();
-            set(Attribute::Scale, &[width.ln(), width.ln(), thin]);
-            set(Attribute::Rotation, &[rotation.w, rotation.x, rotation.y, rotation.z]);
             set(Attribute::Opacity, &[logit(config.initial.opacity)]);
             set(Attribute::Normal, &normal.to_array());
+            let thin = width * config.initial.flatness.max(1e-3);
+            parameters.set_covariance(i, Vec3::new(width, width, thin), rotation);
         }
         let network = match config.residual.network {
             true => {
@@ -192,11 +191,13 @@ impl Model {
         for k in 0..3 {
             push(format!("base_color_{k}"), Attribute::BaseColor, k);
         }
-        for k in 0..3 {
-            push(format!("scale_{k}"), Attribute::Scale, k);
-        }
-        for k in 0..4 {
-            push(format!("rot_{k}"), Attribute::Rotation, k);
+        if p.covariance() == Covariance::RotationScale {
+            (0..3).for_each(|k| push(format!("scale_{k}"), Attribute::Scale, k));
+            (0..4).for_each(|k| push(format!("rot_{k}"), Attribute::Rotation, k));
+        } else {
+            // What we read back; other programs find the decomposition below.
+            (0..3).for_each(|k| push(format!("cholesky_{k}"), Attribute::Scale, k));
+            (0..3).for_each(|k| push(format!("cholesky_{}", 3 + k), Attribute::Shear, k));
         }
         for attribute in [Attribute::Opacity, Attribute::Roughness, Attribute::Metalness, Attribute::Subsurfaceness] {
             push(attribute.name().into(), attribute, 0);
@@ -208,6 +209,17 @@ impl Model {
         }
         // Other programs show f_dc as base + ½ over the degree-0 harmonic: give them the base colour.
         let activated = p.activate();
+        if p.covariance() == Covariance::Cholesky {
+            let g = &activated.gaussians;
+            for k in 0..3 {
+                let values = g.scales.iter().map(|s| s[k].max(f32::MIN_POSITIVE).ln()).collect();
+                table.push(format!("scale_{k}"), ScalarType::F32, values);
+            }
+            for (k, component) in [3, 0, 1, 2].into_iter().enumerate() {
+                let values = g.rotations.iter().map(|q| q.to_array()[component]).collect();
+                table.push(format!("rot_{k}"), ScalarType::F32, values);
+            }
+        }
         for k in 0..3 {
             let values = activated.base_color.iter().map(|c| (c[k] - 0.5) / SH_DEGREE_0).collect();
             table.push(format!("f_dc_{k}"), ScalarType::F32, values);
@@ -225,7 +237,7 @@ const SEQUENCES: [(&str, Attribute); 3] =
 
 fn from_ply(table: &PlyTable, config: &Config, path: &Path) -> Result<GaussianParameters, ReconstructError> {
     let n = table.len;
-    let mut parameters = GaussianParameters::zeros(n, config.residual.transfer_width(), config.residual.codes);
+    let mut parameters = GaussianParameters::zeros(n, &Layout::of(config));
     let mut fill = |name: &str, attribute: Attribute, column: usize| -> Result<(), ReconstructError> {
         let values = table.column(name).ok_or_else(|| ReconstructError::Checkpoint {
             path: path.to_owned(),
@@ -241,10 +253,13 @@ fn from_ply(table: &PlyTable, config: &Config, path: &Path) -> Result<GaussianPa
         fill(name, Attribute::Mean, k)?;
         fill(&format!("n{name}"), Attribute::Normal, k)?;
         fill(&format!("base_color_{k}"), Attribute::BaseColor, k)?;
-        fill(&format!("scale_{k}"), Attribute::Scale, k)?;
     }
-    for k in 0..4 {
-        fill(&format!("rot_{k}"), Attribute::Rotation, k)?;
+    if config.model.covariance == Covariance::RotationScale {
+        (0..3).try_for_each(|k| fill(&format!("scale_{k}"), Attribute::Scale, k))?;
+        (0..4).try_for_each(|k| fill(&format!("rot_{k}"), Attribute::Rotation, k))?;
+    } else {
+        (0..3).try_for_each(|k| fill(&format!("cholesky_{k}"), Attribute::Scale, k))?;
+        (0..3).try_for_each(|k| fill(&format!("cholesky_{}", 3 + k), Attribute::Shear, k))?;
     }
     for attribute in [Attribute::Opacity, Attribute::Roughness, Attribute::Metalness, Attribute::Subsurfaceness] {
         fill(attribute.name(), attribute, 0)?;

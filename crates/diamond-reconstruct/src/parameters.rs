@@ -3,8 +3,9 @@
 //! Raw values are what Adam sees: unbounded numbers. [`GaussianParameters::activate`] turns them into Gaussians,
 //! normals and materials; [`GaussianParameters::pull`] takes the gradient back. `[eq:activations]`
 use crate::adam::{Moments, adam_step};
+use crate::{Config, Covariance};
 use diamond_light::spherical_harmonics::COEFFICIENTS;
-use diamond_splat::{Gaussians, GaussiansGrad};
+use diamond_splat::{Gaussians, GaussiansGrad, LowerFactor};
 use glam::{Quat, Vec3};
 
 /// An attribute that every Gaussian has.
@@ -12,10 +13,12 @@ use glam::{Quat, Vec3};
 pub enum Attribute {
     /// World position, scene units (3).
     Mean,
-    /// Natural log of the standard deviations (3).
+    /// Natural log of the standard deviations, or of the diagonal of the lower factor (3).
     Scale,
-    /// Quaternion w, x, y, z, any length but 0 (4).
+    /// Quaternion w, x, y, z, any length but 0 (4); none where there is a factor.
     Rotation,
+    /// Entries yx, zx, zy of the lower factor over the geometric mean of its diagonal (3); none where there is a rotation.
+    Shear,
     /// Logit (1).
     Opacity,
     /// Normal, any length but 0 (3).
@@ -38,10 +41,11 @@ pub enum Attribute {
 
 impl Attribute {
     /// All attributes, in the order in which they are stored.
-    pub const ALL: [Attribute; 12] = [
+    pub const ALL: [Attribute; 13] = [
         Attribute::Mean,
         Attribute::Scale,
         Attribute::Rotation,
+        Attribute::Shear,
         Attribute::Opacity,
         Attribute::Normal,
         Attribute::BaseColor,
@@ -59,6 +63,7 @@ impl Attribute {
             Attribute::Mean => "mean",
             Attribute::Scale => "scale",
             Attribute::Rotation => "rotation",
+            Attribute::Shear => "shear",
             Attribute::Opacity => "opacity",
             Attribute::Normal => "normal",
             Attribute::BaseColor => "base_color",
@@ -85,11 +90,45 @@ pub struct Group {
     pub moments: Moments,
 }
 
+/// How many raw values each attribute has per Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Layout {
+    /// Form of the covariance.
+    pub covariance: Covariance,
+    /// Transfer values.
+    pub transfer: usize,
+    /// Latent codes.
+    pub codes: usize,
+}
+
+impl Layout {
+    /// What a configuration asks for.
+    pub fn of(config: &Config) -> Self {
+        let residual = &config.residual;
+        Self { covariance: config.model.covariance, transfer: residual.transfer_width(), codes: residual.codes }
+    }
+
+    /// Raw values of an attribute.
+    pub fn width(&self, attribute: Attribute) -> usize {
+        let factor = self.covariance == Covariance::Cholesky;
+        match attribute {
+            Attribute::Mean | Attribute::Scale | Attribute::Normal | Attribute::BaseColor => 3,
+            Attribute::Rotation => 4 * usize::from(!factor),
+            Attribute::Shear => 3 * usize::from(factor),
+            Attribute::VisibilitySh => COEFFICIENTS,
+            Attribute::Transfer => self.transfer,
+            Attribute::Codes => self.codes,
+            Attribute::Opacity | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => 1,
+        }
+    }
+}
+
 /// The raw parameters of N Gaussians.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GaussianParameters {
     groups: Vec<Group>,
     len: usize,
+    covariance: Covariance,
 }
 
 /// What the raw parameters mean.
@@ -135,6 +174,11 @@ pub struct ActivatedGrad {
 /// Normals shorter than this are replaced by +z and get no gradient (their direction is undefined).
 const MIN_NORMAL: f32 = 1e-12;
 
+/// Smallest diagonal entry of a factor, × its largest standard deviation, so that its logarithm exists.
+const MIN_DIAGONAL: f32 = 1e-7;
+/// Standard deviations outside their limits by less than this, × the largest, are left alone.
+const CLAMP_SLACK: f32 = 1e-6;
+
 /// Logistic function.
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
@@ -150,24 +194,106 @@ fn vec3s(values: &[f32]) -> impl Iterator<Item = Vec3> + '_ {
     values.chunks_exact(3).map(|c| Vec3::new(c[0], c[1], c[2]))
 }
 
+/// `[eq:cholesky-raw]` L from raw values: e^a on the diagonal, g·shear below it, with g = e^(mean of a), so that shears have
+/// no unit, a change of size moves the diagonal alone, and one learning rate suits Gaussians of any size. `shear` holds
+/// yx, zx, zy.
+fn lower_factor(log_diagonal: Vec3, shear: Vec3) -> LowerFactor {
+    let [x, y, z] = log_diagonal.exp().to_array();
+    let [yx, zx, zy] = (shear * (log_diagonal.element_sum() / 3.0).exp()).to_array();
+    LowerFactor([x, yx, y, zx, zy, z])
+}
+
+/// Pullback of [`lower_factor`]: to the log-diagonal and to the shear.
+fn lower_factor_pull(log_diagonal: Vec3, shear: Vec3, d: &LowerFactor) -> (Vec3, Vec3) {
+    let [xx, yx, yy, zx, zy, zz] = d.0;
+    let size = (log_diagonal.element_sum() / 3.0).exp();
+    let d_shear = Vec3::new(yx, zx, zy) * size;
+    (Vec3::new(xx, yy, zz) * log_diagonal.exp() + Vec3::splat(d_shear.dot(shear) / 3.0), d_shear)
+}
+
+/// Raw values of a factor; diagonal entries count as at least `least` (above 0).
+fn raw_of_factor(factor: &LowerFactor, least: f32) -> (Vec3, Vec3) {
+    let [xx, yx, yy, zx, zy, zz] = factor.0;
+    let log_diagonal = Vec3::new(xx, yy, zz).max(Vec3::splat(least)).map(f32::ln);
+    let size = (log_diagonal.element_sum() / 3.0).exp();
+    (log_diagonal, Vec3::new(yx, zx, zy) / size)
+}
+
 impl GaussianParameters {
-    /// `len` Gaussians of zeros with `transfer` transfer values and `codes` codes each.
-    pub fn zeros(len: usize, transfer: usize, codes: usize) -> Self {
+    /// Gives Gaussian `i` these standard deviations (above 0) and this rotation, in whichever form is used.
+    pub fn set_covariance(&mut self, i: usize, scale: Vec3, rotation: Quat) {
+        match self.covariance {
+            Covariance::RotationScale => {
+                self.row_mut(Attribute::Scale, i).copy_from_slice(&scale.map(f32::ln).to_array());
+                let wxyz = [rotation.w, rotation.x, rotation.y, rotation.z];
+                self.row_mut(Attribute::Rotation, i).copy_from_slice(&wxyz);
+            }
+            Covariance::Cholesky => {
+                let least = scale.max_element() * MIN_DIAGONAL;
+                let (log_diagonal, shear) = raw_of_factor(&LowerFactor::from_scale_rotation(scale, rotation), least);
+                self.row_mut(Attribute::Scale, i).copy_from_slice(&log_diagonal.to_array());
+                self.row_mut(Attribute::Shear, i).copy_from_slice(&shear.to_array());
+            }
+        }
+    }
+
+    /// Multiplies all standard deviations of Gaussian `i`: in either form the same number is added to three logarithms.
+    pub fn scale_covariance(&mut self, i: usize, factor: f32) {
+        self.row_mut(Attribute::Scale, i).iter_mut().for_each(|s| *s += factor.ln());
+    }
+
+    /// Keeps every standard deviation in `low..=high` (scene units): eigenvalues of the covariance, whatever its form.
+    /// A projection after the step, so that it stops no gradient.
+    pub fn clamp_covariances(&mut self, low: f32, high: f32) {
+        if self.covariance == Covariance::RotationScale {
+            let (low, high) = (low.ln(), high.ln());
+            self.values_mut(Attribute::Scale).iter_mut().for_each(|s| *s = s.clamp(low, high));
+            return;
+        }
+        for i in 0..self.len {
+            let (scale, shear) =
+                (Vec3::from_slice(self.row(Attribute::Scale, i)), Vec3::from_slice(self.row(Attribute::Shear, i)));
+            let (scale, rotation) = lower_factor(scale, shear).scale_rotation();
+            let clamped = scale.clamp(Vec3::splat(low), Vec3::splat(high));
+            // Rounding of the decomposition alone must not move anything.
+            if (clamped - scale).abs().max_element() > CLAMP_SLACK * high.min(scale.max_element()) {
+                self.set_covariance(i, clamped, rotation);
+            }
+        }
+    }
+
+    /// Opacities in (0, 1).
+    pub fn opacities(&self) -> Vec<f32> {
+        self.values(Attribute::Opacity).iter().map(|&x| sigmoid(x)).collect()
+    }
+
+    /// The raw values of one Gaussian.
+    pub fn row(&self, attribute: Attribute, i: usize) -> &[f32] {
+        let group = self.group(attribute);
+        &group.values[i * group.width..(i + 1) * group.width]
+    }
+
+    /// The raw values of one Gaussian, mutable.
+    pub fn row_mut(&mut self, attribute: Attribute, i: usize) -> &mut [f32] {
+        let group = self.group_mut(attribute);
+        &mut group.values[i * group.width..(i + 1) * group.width]
+    }
+
+    /// `len` Gaussians of zeros.
+    pub fn zeros(len: usize, layout: &Layout) -> Self {
         let groups = Attribute::ALL
             .iter()
             .map(|&attribute| {
-                let width = match attribute {
-                    Attribute::Mean | Attribute::Scale | Attribute::Normal | Attribute::BaseColor => 3,
-                    Attribute::Rotation => 4,
-                    Attribute::VisibilitySh => COEFFICIENTS,
-                    Attribute::Transfer => transfer,
-                    Attribute::Codes => codes,
-                    _ => 1,
-                };
+                let width = layout.width(attribute);
                 Group { attribute, width, values: vec![0.0; len * width], moments: Moments::zeros(len * width) }
             })
             .collect();
-        Self { groups, len }
+        Self { groups, len, covariance: layout.covariance }
+    }
+
+    /// Form of the covariances.
+    pub fn covariance(&self) -> Covariance {
+        self.covariance
     }
 
     /// Number of Gaussians.
@@ -208,19 +334,25 @@ impl GaussianParameters {
     /// Raw → meaning.
     pub fn activate(&self) -> Activated {
         let scalar = |a: Attribute| self.values(a).iter().map(|&x| sigmoid(x)).collect::<Vec<f32>>();
+        let mut gaussians = Gaussians {
+            means: vec3s(self.values(Attribute::Mean)).collect(),
+            opacities: scalar(Attribute::Opacity),
+            ..Default::default()
+        };
+        match self.covariance {
+            Covariance::RotationScale => {
+                gaussians.scales = vec3s(self.values(Attribute::Scale)).map(Vec3::exp).collect();
+                let quaternions = self.values(Attribute::Rotation).chunks_exact(4);
+                gaussians.rotations = quaternions.map(|q| Quat::from_xyzw(q[1], q[2], q[3], q[0])).collect();
+            }
+            Covariance::Cholesky => {
+                let rows = vec3s(self.values(Attribute::Scale)).zip(vec3s(self.values(Attribute::Shear)));
+                gaussians.factors = rows.map(|(log_diagonal, shear)| lower_factor(log_diagonal, shear)).collect();
+                gaussians.decompose_factors();
+            }
+        }
         Activated {
-            gaussians: Gaussians {
-                means: vec3s(self.values(Attribute::Mean)).collect(),
-                scales: vec3s(self.values(Attribute::Scale))
-                    .map(|s| Vec3::new(s.x.exp(), s.y.exp(), s.z.exp()))
-                    .collect(),
-                rotations: self
-                    .values(Attribute::Rotation)
-                    .chunks_exact(4)
-                    .map(|q| Quat::from_xyzw(q[1], q[2], q[3], q[0]))
-                    .collect(),
-                opacities: scalar(Attribute::Opacity),
-            },
+            gaussians,
             normals: vec3s(self.values(Attribute::Normal))
                 .map(|n| if n.length() > MIN_NORMAL { n / n.length() } else { Vec3::Z })
                 .collect(),
@@ -251,11 +383,24 @@ impl GaussianParameters {
         let raw = |g: &[f32], a: Attribute| {
             if g.is_empty() { vec![0.0; self.values(a).len()] } else { g.to_vec() }
         };
+        let factors = |part: &dyn Fn((Vec3, Vec3)) -> Vec3| -> Vec<f32> {
+            if grad.gaussians.factors.is_empty() {
+                return vec![0.0; 3 * self.len];
+            }
+            let raw = vec3s(self.values(Attribute::Scale)).zip(vec3s(self.values(Attribute::Shear)));
+            let rows = raw.zip(&grad.gaussians.factors);
+            rows.flat_map(|((log_diagonal, shear), d)| part(lower_factor_pull(log_diagonal, shear, d)).to_array())
+                .collect()
+        };
         Attribute::ALL
             .iter()
             .map(|&attribute| match attribute {
                 Attribute::Mean => of_vec3(&grad.gaussians.means, &|_, d| d),
+                Attribute::Scale if self.covariance == Covariance::Cholesky => factors(&|(scale, _)| scale),
                 Attribute::Scale => of_vec3(&grad.gaussians.scales, &|i, d| d * at.gaussians.scales[i]),
+                Attribute::Shear if self.covariance == Covariance::Cholesky => factors(&|(_, shear)| shear),
+                Attribute::Shear => Vec::new(),
+                Attribute::Rotation if self.covariance == Covariance::Cholesky => Vec::new(),
                 Attribute::Rotation if grad.gaussians.rotations.is_empty() => vec![0.0; 4 * self.len],
                 Attribute::Rotation => grad.gaussians.rotations.iter().flat_map(|d| [d.w, d.x, d.y, d.z]).collect(),
                 Attribute::Opacity => of_logit(&grad.gaussians.opacities, &at.gaussians.opacities),
@@ -319,7 +464,7 @@ impl GaussianParameters {
                 }
             })
             .collect();
-        Self { groups, len: sources.len() }
+        Self { groups, len: sources.len(), covariance: self.covariance }
     }
 
     /// The first value that is not finite: attribute and Gaussian.
@@ -336,8 +481,63 @@ mod tests {
     use super::*;
     use diamond_testkit::{Dual, Real};
 
+    fn layout(covariance: Covariance) -> Layout {
+        Layout { covariance, transfer: 2, codes: 1 }
+    }
+
+    /// `[eq:cholesky-raw]`: the pullback of both forms' raw values against dual numbers.
+    #[test]
+    fn the_pullback_of_cholesky_values_agrees_with_dual_numbers() {
+        let mut random = crate::random::Random::new(5, crate::random::Purpose::Initial, 0);
+        for _ in 0..64 {
+            let (a, shear) = (random.normal3(), random.normal3());
+            let d = LowerFactor(std::array::from_fn(|_| random.normal()));
+            let x: Vec<f64> = a.to_array().into_iter().chain(shear.to_array()).map(f64::from).collect();
+            let oracle = |x: &[Dual]| {
+                let size = ((x[0] + x[1] + x[2]) / Dual::of(3.0)).exp();
+                vec![x[0].exp(), x[3] * size, x[1].exp(), x[4] * size, x[5] * size, x[2].exp()]
+            };
+            let expected = diamond_testkit::vjp(oracle, &x, &d.0.map(f64::from));
+            let (d_a, d_shear) = lower_factor_pull(a, shear, &d);
+            for (found, expected) in d_a.to_array().into_iter().chain(d_shear.to_array()).zip(expected) {
+                assert!((f64::from(found) - expected).abs() < 1e-5 * (1.0 + expected.abs()), "{found} {expected}");
+            }
+            // There and back.
+            let (b, back) = raw_of_factor(&lower_factor(a, shear), 1e-9);
+            assert!((a - b).length() + (shear - back).length() < 1e-4, "{a} {b}, {shear} {back}");
+        }
+    }
+
+    /// The same covariance is set, scaled and clamped in both forms.
+    #[test]
+    fn both_forms_hold_the_same_covariance() {
+        let mut random = crate::random::Random::new(6, crate::random::Purpose::Initial, 0);
+        let forms = [Covariance::RotationScale, Covariance::Cholesky];
+        let mut both = forms.map(|f| GaussianParameters::zeros(8, &layout(f)));
+        for i in 0..8 {
+            let (scale, rotation) =
+                ((random.normal3() - 3.0).exp(), Quat::from_array(std::array::from_fn(|_| random.normal())));
+            both.iter_mut().for_each(|p| p.set_covariance(i, scale, rotation));
+        }
+        both.iter_mut().for_each(|p| {
+            p.scale_covariance(2, 0.5);
+            p.clamp_covariances(0.02, 0.2);
+        });
+        let [a, b] = both.map(|p| p.activate().gaussians);
+        assert!(a.factors.is_empty() && b.factors.len() == 8);
+        for i in 0..8 {
+            let sigma = |g: &Gaussians| {
+                let m = glam::Mat3::from_quat(g.rotations[i].normalize()) * glam::Mat3::from_diagonal(g.scales[i]);
+                m * m.transpose()
+            };
+            let difference = (sigma(&a) - sigma(&b)).to_cols_array().iter().fold(0.0f32, |m, v| m.max(v.abs()));
+            assert!(difference < 1e-5 * a.scales[i].max_element().powi(2), "Gaussian {i}: {difference:e}");
+            assert!(b.scales[i].max_element() < 0.2001 && b.scales[i].min_element() > 0.01999, "{}", b.scales[i]);
+        }
+    }
+
     fn example() -> GaussianParameters {
-        let mut p = GaussianParameters::zeros(3, 2, 1);
+        let mut p = GaussianParameters::zeros(3, &layout(Covariance::RotationScale));
         let mut random = crate::random::Random::new(3, crate::random::Purpose::Initial, 0);
         for a in Attribute::ALL {
             p.values_mut(a).iter_mut().for_each(|v| *v = random.normal());
@@ -393,7 +593,7 @@ mod tests {
 
     #[test]
     fn a_zero_normal_is_finite() {
-        let p = GaussianParameters::zeros(1, 0, 0);
+        let p = GaussianParameters::zeros(1, &layout(Covariance::RotationScale));
         let at = p.activate();
         let grad = ActivatedGrad { normals: vec![Vec3::ONE], ..Default::default() };
         assert!(p.pull(&at, &grad).iter().flatten().all(|v| v.is_finite()));

@@ -18,6 +18,10 @@ pub enum Purpose {
     Split = 4,
     /// Gaussians on which SH visibility is compared.
     VisibilitySamples = 5,
+    /// Who is relocated where.
+    Relocation = 6,
+    /// Noise on the means.
+    Noise = 7,
 }
 
 /// A seeded stream of random numbers.
@@ -36,6 +40,11 @@ impl Random {
     /// Uniform in [0, 1), 24 bits.
     pub fn uniform(&mut self) -> f32 {
         (self.0.next_u32() >> 8) as f32 * (1.0 / (1 << 24) as f32)
+    }
+
+    /// Uniform in [0, 1), 53 bits.
+    pub fn uniform64(&mut self) -> f64 {
+        (self.0.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
     /// Uniform in 0..n (n > 0; the bias of the multiplication is below n / 2⁶⁴).

@@ -110,7 +110,7 @@ fn from_hull(capture: &Capture, config: &Config) -> Result<Option<InitialPoints>
         return Ok(None);
     }
     let cloud = PointCloud { positions: hull.points, normals: Some(hull.normals), colors: None };
-    let mut points = from_cloud(cloud, config.initial.count);
+    let mut points = from_cloud(cloud, config.initial_count());
     points.origin = format!("{} points of the visual hull of {} masks", points.positions.len(), masks.len());
     Ok(Some(points))
 }
@@ -119,7 +119,7 @@ fn uniform(centre: Vec3, radius: f32, config: &Config) -> InitialPoints {
     let mut random = crate::random::Random::new(config.seed, crate::random::Purpose::Initial, 0);
     let mut draw = || random.uniform() * 2.0 - 1.0;
     let positions: Vec<Vec3> =
-        (0..config.initial.count).map(|_| centre + radius * Vec3::new(draw(), draw(), draw())).collect();
+        (0..config.initial_count()).map(|_| centre + radius * Vec3::new(draw(), draw(), draw())).collect();
     let normals = positions.iter().map(|p| (*p - centre).try_normalize().unwrap_or(Vec3::Z)).collect();
     InitialPoints { positions, normals, origin: "uniform in the bounds".into() }
 }
@@ -135,7 +135,7 @@ pub fn survey(capture: &Capture, config: &Config) -> Result<(Scene, InitialPoint
         InitialSource::Points | InitialSource::Auto if capture.points.is_some() => {
             let path = capture.points.as_ref().ok_or_else(|| unusable("no point cloud"))?;
             let cloud = PointCloud::read(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })?;
-            let mut points = from_cloud(cloud, config.initial.count);
+            let mut points = from_cloud(cloud, config.initial_count());
             points.origin = format!("{} points of {}", points.positions.len(), path.display());
             (!points.positions.is_empty()).then_some(points)
         }

@@ -1,5 +1,5 @@
 //! What changes with the step: learning rates, warm-ups, unfreezing, rounds of density control.
-use crate::Config;
+use crate::{Config, DensityStrategy};
 
 /// Everything that depends on the step number, for one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,6 +18,10 @@ pub struct StepPlan {
     pub collect_density: bool,
     /// Whether a round of density control follows this step.
     pub densify: bool,
+    /// Whether a round of density control may add Gaussians.
+    pub grow: bool,
+    /// Whether a round of density control drops too large Gaussians.
+    pub prune_large: bool,
     /// Whether opacities are reset after this step.
     pub reset_opacity: bool,
 }
@@ -49,7 +53,14 @@ impl StepPlan {
         let at = |f: f32| (f as f64 * config.steps as f64).round() as u64;
         let (from, until) = (at(d.from), at(d.until));
         let done = step + 1;
-        let active = d.enabled && done <= until;
+        let frozen = fraction >= d.freeze_count;
+        let active = done <= until
+            && match d.strategy {
+                DensityStrategy::Adaptive => !frozen,
+                DensityStrategy::Mcmc => true,
+                DensityStrategy::None => false,
+            };
+        let adaptive = active && d.strategy == DensityStrategy::Adaptive;
         let reset = at(d.reset_every);
         Self {
             mean_rate: log_lerp(r.mean, r.mean_final, mean_progress),
@@ -57,9 +68,11 @@ impl StepPlan {
             network_rate: log_lerp(r.network, r.network_final, fraction),
             incident_offset,
             roughness_frozen: fraction < s.roughness_unfreeze,
-            collect_density: active,
+            collect_density: adaptive,
             densify: active && done > from && done.is_multiple_of(d.every_steps),
-            reset_opacity: active && reset > 0 && done.is_multiple_of(reset) && done < until,
+            grow: !frozen,
+            prune_large: fraction >= d.large_from,
+            reset_opacity: adaptive && reset > 0 && done.is_multiple_of(reset) && done < until,
         }
     }
 }
@@ -84,6 +97,26 @@ mod tests {
             .count() as u64;
         assert_eq!(rounds, expected);
         assert!(StepPlan::new(&config, 10).roughness_frozen && !StepPlan::new(&config, 500).roughness_frozen);
+    }
+
+    #[test]
+    fn a_frozen_count_stops_all_but_relocation() {
+        let mut config = Config::preset("resolved").unwrap();
+        config.steps = 1000;
+        config.density.until = 1.0;
+        config.density.freeze_count = 0.5;
+        let rounds = |c: &Config, from: u64| {
+            (from..from + 500).map(|s| StepPlan::new(c, s)).fold([0, 0, 0], |[a, b, c], p| {
+                [a + u32::from(p.densify), b + u32::from(p.densify && p.grow), c + u32::from(p.reset_opacity)]
+            })
+        };
+        assert!(rounds(&config, 0).iter().all(|n| *n > 0));
+        assert_eq!(rounds(&config, 500), [0, 0, 0]);
+        config.density.strategy = DensityStrategy::Mcmc;
+        let [moves, grows, resets] = rounds(&config, 500);
+        assert!(moves > 0 && grows == 0 && resets == 0);
+        config.density.strategy = DensityStrategy::None;
+        assert_eq!(rounds(&config, 0), [0, 0, 0]);
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! The map from one Gaussian to its footprint on screen, in f64, and its pullback.
-use crate::Gaussians;
+use crate::{Gaussians, LowerFactor};
 use diamond_camera::Camera;
 use glam::{Quat, Vec3, Vec4};
 
@@ -68,45 +68,54 @@ pub(crate) struct Linearised {
     /// Unit quaternion x, y, z, w and 1/norm (0 where it counts as the identity).
     q: [f64; 4],
     inv_norm: f64,
-    /// Rotation of the Gaussian in camera axes.
+    /// Rotation of the Gaussian in camera axes; its lower factor in camera axes where it has one.
     v: [[f64; 3]; 3],
-    /// A = J · W · R_q · diag(s), 2 × 3.
+    /// Standard deviations; ones where it has a lower factor.
+    s: [f64; 3],
+    /// A = J · W · R_q · diag(s), or J · W · L, 2 × 3.
     pub a: [[f64; 3]; 2],
 }
 
 impl Linearised {
-    pub fn new(mean: Vec3, scale: Vec3, rotation: Quat, view: &View) -> Self {
-        let p = view.to_camera(mean);
+    /// Of Gaussian `i`.
+    pub fn of(g: &Gaussians, i: usize, view: &View) -> Self {
+        let p = view.to_camera(g.means[i]);
         let inv_z = 1.0 / p[2];
         let raw = [p[0] * inv_z, p[1] * inv_z];
         let [x, y] = view.limits;
         let tangent = [raw[0].max(x[0]).min(x[1]), raw[1].max(y[0]).min(y[1])];
         let free = [tangent[0] == raw[0], tangent[1] == raw[1]];
-        let [qx, qy, qz, qw] = rotation.to_array().map(f64::from);
-        let norm2 = qx * qx + qy * qy + qz * qz + qw * qw;
-        let (q, inv_norm) = if norm2 < MIN_QUATERNION_NORM2 {
-            ([0.0, 0.0, 0.0, 1.0], 0.0)
-        } else {
-            let inv = 1.0 / norm2.sqrt();
-            ([qx * inv, qy * inv, qz * inv, qw * inv], inv)
+        let (q, inv_norm) = unit_quaternion(g.rotations[i]);
+        let (root, s) = match g.factors.get(i) {
+            Some(factor) => (factor.matrix(), [1.0; 3]),
+            None => (rotation_matrix(q), g.scales[i].to_array().map(f64::from)),
         };
-        let rotation = rotation_matrix(q);
         let mut v = [[0.0; 3]; 3];
         for r in 0..3 {
             for c in 0..3 {
-                v[r][c] = view.w[r][0] * rotation[0][c] + view.w[r][1] * rotation[1][c] + view.w[r][2] * rotation[2][c];
+                v[r][c] = view.w[r][0] * root[0][c] + view.w[r][1] * root[1][c] + view.w[r][2] * root[2][c];
             }
         }
-        let s = scale.to_array();
         let mut a = [[0.0; 3]; 2];
         for axis in 0..2 {
             let k = view.f[axis] * inv_z;
             for j in 0..3 {
-                a[axis][j] = k * (v[axis][j] - tangent[axis] * v[2][j]) * s[j] as f64;
+                a[axis][j] = k * (v[axis][j] - tangent[axis] * v[2][j]) * s[j];
             }
         }
-        Self { p, tangent, free, q, inv_norm, v, a }
+        Self { p, tangent, free, q, inv_norm, v, s, a }
     }
+}
+
+/// Normalised x, y, z, w and 1/norm; the identity and 0 where it is too short.
+fn unit_quaternion(rotation: Quat) -> ([f64; 4], f64) {
+    let [qx, qy, qz, qw] = rotation.to_array().map(f64::from);
+    let norm2 = qx * qx + qy * qy + qz * qz + qw * qw;
+    if norm2 < MIN_QUATERNION_NORM2 {
+        return ([0.0, 0.0, 0.0, 1.0], 0.0);
+    }
+    let inv = 1.0 / norm2.sqrt();
+    ([qx * inv, qy * inv, qz * inv, qw * inv], inv)
 }
 
 fn rotation_matrix([x, y, z, w]: [f64; 4]) -> [[f64; 3]; 3] {
@@ -145,12 +154,14 @@ pub(crate) struct GaussianGrad {
     pub mean: Vec3,
     pub scale: Vec3,
     pub rotation: Vec4,
+    /// Zero for Gaussians without a factor; those with one have zero scale and rotation gradients.
+    pub factor: LowerFactor,
 }
 
 /// Pullback of the projection of Gaussian `i` (all but the opacity, which does not move a footprint).
 pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGrad) -> GaussianGrad {
-    let lin = Linearised::new(g.means[i], g.scales[i], g.rotations[i], view);
-    let s = g.scales[i].to_array().map(f64::from);
+    let lin = Linearised::of(g, i, view);
+    let s = lin.s;
     let inv_z = 1.0 / lin.p[2];
     let k = [view.f[0] * inv_z, view.f[1] * inv_z];
     let mut d_p = [0.0, 0.0, d.depth];
@@ -178,20 +189,26 @@ pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGr
         d_p[2] -= d_ratio * lin.p[axis] * inv_z * inv_z;
     }
     let d_mean = view.to_world_axes(d_p);
-    let mut d_rotation = [[0.0; 3]; 3];
+    let mut d_root = [[0.0; 3]; 3];
     for j in 0..3 {
         let column = view.to_world_axes([d_v[0][j], d_v[1][j], d_v[2][j]]);
         for r in 0..3 {
-            d_rotation[r][j] = column[r];
+            d_root[r][j] = column[r];
         }
     }
-    let d_unit = rotation_matrix_pull(lin.q, d_rotation);
+    let mean = Vec3::from_array(d_mean.map(finite_f32));
+    if !g.factors.is_empty() {
+        let factor = LowerFactor::matrix_pull(d_root);
+        return GaussianGrad { mean, scale: Vec3::ZERO, rotation: Vec4::ZERO, factor };
+    }
+    let d_unit = rotation_matrix_pull(lin.q, d_root);
     let along: f64 = (0..4).map(|c| d_unit[c] * lin.q[c]).sum();
     let d_q: [f64; 4] = std::array::from_fn(|c| (d_unit[c] - along * lin.q[c]) * lin.inv_norm);
     GaussianGrad {
-        mean: Vec3::from_array(d_mean.map(finite_f32)),
+        mean,
         scale: Vec3::from_array(d_s.map(finite_f32)),
         rotation: Vec4::from_array(d_q.map(finite_f32)),
+        factor: LowerFactor::default(),
     }
 }
 
@@ -204,12 +221,41 @@ pub(crate) fn finite_f32(v: f64) -> f32 {
 mod tests {
     use super::*;
     use diamond_camera::{Intrinsics, Pose};
-    use diamond_testkit::splat::{SplatCamera, SplatRules, project_splat};
+    use diamond_testkit::splat::{SplatCamera, SplatRules, project_covariance, project_splat};
     use diamond_testkit::{Dual, Real, adjoint::relative_l2, vjp};
     use proptest::prelude::*;
 
     fn unit() -> impl Strategy<Value = f32> {
         -1.0f32..1.0
+    }
+
+    /// A camera, the oracle's picture of it, and the rules.
+    fn setting() -> (Camera, SplatCamera, SplatRules) {
+        let intrinsics = Intrinsics { fx: 31.0, fy: 27.0, cx: 11.0, cy: 20.0, width: 33, height: 29 };
+        let pose = Pose::look_at(Vec3::new(0.4, -0.3, -2.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y);
+        let r = pose.rotation.to_cols_array_2d();
+        let oracle = SplatCamera {
+            rotation: std::array::from_fn(|row| std::array::from_fn(|col| r[col][row] as f64)),
+            translation: pose.translation.to_array().map(f64::from),
+            focal: [31.0, 27.0],
+            centre: [11.0, 20.0],
+            size: [33, 29],
+        };
+        let rules = SplatRules {
+            low_pass: 0.3,
+            max_alpha: 0.99,
+            min_alpha: 1.0 / 255.0,
+            min_transmittance: 1e-4,
+            near: 0.2,
+            smooth: false,
+        };
+        (Camera { intrinsics, pose }, oracle, rules)
+    }
+
+    /// Mean, covariance and z from the oracle's mean, conic and z.
+    fn of_conic(m: [Dual; 2], c: [Dual; 3], z: Dual) -> Vec<Dual> {
+        let det = c[0] * c[2] - c[1] * c[1];
+        vec![m[0], m[1], c[2] / det, -c[1] / det, c[0] / det, z]
     }
 
     proptest! {
@@ -225,26 +271,12 @@ mod tests {
             d in [unit(), unit(), unit(), unit(), unit(), unit()],
         ) {
             prop_assume!(q.iter().map(|v| v * v).sum::<f32>() > 0.01);
-            let intrinsics = Intrinsics { fx: 31.0, fy: 27.0, cx: 11.0, cy: 20.0, width: 33, height: 29 };
-            let pose = Pose::look_at(Vec3::new(0.4, -0.3, -2.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y);
-            let camera = Camera { intrinsics, pose };
-            let r = pose.rotation.to_cols_array_2d();
-            let oracle = SplatCamera {
-                rotation: std::array::from_fn(|row| std::array::from_fn(|col| r[col][row] as f64)),
-                translation: pose.translation.to_array().map(f64::from),
-                focal: [31.0, 27.0],
-                centre: [11.0, 20.0],
-                size: [33, 29],
-            };
-            let rules = SplatRules {
-                low_pass: 0.3, max_alpha: 0.99, min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, near: 0.2, smooth: false,
-            };
+            let (camera, oracle, rules) = setting();
             let f = |x: &[Dual]| {
                 let mut g = x.to_vec();
                 g.push(Dual::of(0.5));
                 let (m, c, z) = project_splat(&g, &oracle, &rules).expect("in front of the camera");
-                let det = c[0] * c[2] - c[1] * c[1];
-                vec![m[0], m[1], c[2] / det, -c[1] / det, c[0] / det, z]
+                of_conic(m, c, z)
             };
             let x: Vec<f64> = mean.iter().chain(&scale).chain(&q).map(|&v| v as f64).collect();
             let d = d.map(f64::from);
@@ -260,6 +292,40 @@ mod tests {
                 .map(f64::from)
                 .collect();
             for (range, what) in [(0..3, "mean"), (3..6, "scale"), (6..10, "rotation")] {
+                let error = relative_l2(&found[range.clone()], &expected[range], 1e-6);
+                prop_assert!(error < 1e-5, "{}: {:.2e}", what, error);
+            }
+        }
+
+        /// [eq:lower-factor]: the same for Gaussians that are given by a lower factor, against the projection of Σ = L Lᵀ
+        /// by dual numbers.
+        #[test]
+        fn the_pullback_of_a_factor_agrees_with_dual_numbers(
+            mean in [unit(), unit(), unit()],
+            l in [0.01f32..0.5, -0.5f32..0.5, 0.01f32..0.5, -0.5f32..0.5, -0.5f32..0.5, 0.01f32..0.5],
+            d in [unit(), unit(), unit(), unit(), unit(), unit()],
+        ) {
+            let (camera, oracle, rules) = setting();
+            let f = |x: &[Dual]| {
+                let zero = Dual::of(0.0);
+                let root = [[x[3], zero, zero], [x[4], x[5], zero], [x[6], x[7], x[8]]];
+                let sum = |f: &dyn Fn(usize) -> Dual| f(0) + f(1) + f(2);
+                let sigma = std::array::from_fn(|r| std::array::from_fn(|c| sum(&|k| root[r][k] * root[c][k])));
+                let (m, c, z) =
+                    project_covariance(&x[..3], &sigma, &oracle, &rules).expect("in front of the camera");
+                of_conic(m, c, z)
+            };
+            let x: Vec<f64> = mean.iter().chain(&l).map(|&v| v as f64).collect();
+            let d = d.map(f64::from);
+            let expected = vjp(f, &x, &[d[0], d[1], d[2], 2.0 * d[3], d[4], d[5]]);
+            let mut g = Gaussians::default();
+            g.push(Vec3::from_array(mean), Vec3::ONE, Quat::IDENTITY, 0.5);
+            g.factors.push(LowerFactor(l));
+            let footprint = FootprintGrad { mean: [d[0], d[1]], cov: [d[2], d[3], d[4]], depth: d[5] };
+            let found = project_pull(&g, 0, &View::new(&camera), &footprint);
+            prop_assert_eq!((found.scale, found.rotation), (Vec3::ZERO, Vec4::ZERO));
+            let found: Vec<f64> = found.mean.to_array().into_iter().chain(found.factor.0).map(f64::from).collect();
+            for (range, what) in [(0..3, "mean"), (3..9, "factor")] {
                 let error = relative_l2(&found[range.clone()], &expected[range], 1e-6);
                 prop_assert!(error < 1e-5, "{}: {:.2e}", what, error);
             }

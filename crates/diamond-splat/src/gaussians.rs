@@ -1,6 +1,7 @@
 //! The vocabulary: anisotropic 3D Gaussians after activation, their gradient, and the features they carry.
-use crate::SplatError;
+use crate::{LowerFactor, SplatError};
 use glam::{Quat, Vec2, Vec3, Vec4};
+use rayon::prelude::*;
 
 /// Anisotropic Gaussians, structure of arrays, after activation.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -13,6 +14,10 @@ pub struct Gaussians {
     pub rotations: Vec<Quat>,
     /// Peak opacities in [0, 1].
     pub opacities: Vec<f32>,
+    /// Empty, or one lower factor `L` of the covariance `Σ = L Lᵀ` per Gaussian. Where there are factors, the rasteriser
+    /// takes them and its gradient goes to them, not to scales and rotations, which must then hold the decomposition of
+    /// the factors for everybody else: see [`Gaussians::decompose_factors`].
+    pub factors: Vec<LowerFactor>,
 }
 
 /// Gradient of [`Gaussians`].
@@ -26,6 +31,8 @@ pub struct GaussiansGrad {
     pub rotations: Vec<Vec4>,
     /// d loss / d opacity.
     pub opacities: Vec<f32>,
+    /// d loss / d factor, empty where the Gaussians have none.
+    pub factors: Vec<LowerFactor>,
 }
 
 /// N × C values that are blended: row `i` belongs to Gaussian `i`.
@@ -56,6 +63,19 @@ impl Gaussians {
         self.opacities.push(opacity);
     }
 
+    /// Sets scales and rotations to the decomposition of the factors, where there are any.
+    pub fn decompose_factors(&mut self) {
+        let (scales, rotations) = self
+            .factors
+            .par_iter()
+            .with_min_len(256)
+            .map(LowerFactor::scale_rotation)
+            .unzip::<Vec3, Quat, Vec<_>, Vec<_>>();
+        if !self.factors.is_empty() {
+            (self.scales, self.rotations) = (scales, rotations);
+        }
+    }
+
     /// `Err` unless the arrays have equal lengths, everything is finite, scales are ≥ 0 and opacities in [0, 1].
     pub fn validate(&self) -> Result<(), SplatError> {
         let n = self.len();
@@ -68,11 +88,15 @@ impl Gaussians {
         same("Gaussians::scales", self.scales.len())?;
         same("Gaussians::rotations", self.rotations.len())?;
         same("Gaussians::opacities", self.opacities.len())?;
+        if !self.factors.is_empty() {
+            same("Gaussians::factors", self.factors.len())?;
+        }
         let finite = |what, bad: Option<usize>| bad.map_or(Ok(()), |index| Err(SplatError::NonFinite { what, index }));
         finite("Gaussians::means", self.means.iter().position(|v| !v.is_finite()))?;
         finite("Gaussians::scales", self.scales.iter().position(|v| !v.is_finite()))?;
         finite("Gaussians::rotations", self.rotations.iter().position(|q| !q.is_finite()))?;
         finite("Gaussians::opacities", self.opacities.iter().position(|v| !v.is_finite()))?;
+        finite("Gaussians::factors", self.factors.iter().position(|l| l.0.iter().any(|v| !v.is_finite())))?;
         if let Some(index) = self.scales.iter().position(|s| s.min_element() < 0.0) {
             let found = self.scales[index].min_element();
             return Err(SplatError::Range { what: "Gaussians::scales", index, expected: "[0, ∞)", found });
@@ -93,6 +117,7 @@ impl GaussiansGrad {
             scales: vec![Vec3::ZERO; n],
             rotations: vec![Vec4::ZERO; n],
             opacities: vec![0.0; n],
+            factors: Vec::new(),
         }
     }
 
@@ -119,6 +144,12 @@ impl GaussiansGrad {
         self.scales.iter_mut().zip(&other.scales).for_each(|(a, b)| *a += *b);
         self.rotations.iter_mut().zip(&other.rotations).for_each(|(a, b)| *a += *b);
         self.opacities.iter_mut().zip(&other.opacities).for_each(|(a, b)| *a += *b);
+        if self.factors.is_empty() {
+            self.factors.clone_from(&other.factors);
+        } else {
+            let pairs = self.factors.iter_mut().zip(&other.factors);
+            pairs.for_each(|(a, b)| a.0.iter_mut().zip(&b.0).for_each(|(a, b)| *a += *b));
+        }
         Ok(())
     }
 }

@@ -226,7 +226,7 @@ fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> O
     if !(z > config.near as f64 && z < MAX_DEPTH) {
         return None;
     }
-    let lin = Linearised::new(g.means[i], g.scales[i], g.rotations[i], view);
+    let lin = Linearised::of(g, i, view);
     let [r0, r1] = lin.a;
     let xx: f64 = r0.iter().map(|v| v * v).sum();
     let yy: f64 = r1.iter().map(|v| v * v).sum();

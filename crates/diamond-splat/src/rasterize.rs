@@ -6,7 +6,7 @@ use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::{Level, Thresholds};
 use crate::projection::{CHUNK, is_smooth, project};
 use crate::pullback::{GEOMETRY, RegionBackward};
-use crate::{Features, Gaussians, GaussiansGrad, Projection, RasterConfig, RasterPull, SplatError};
+use crate::{Features, Gaussians, GaussiansGrad, LowerFactor, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use glam::Vec2;
@@ -270,6 +270,9 @@ impl RasterPullback<'_> {
         let bins = &self.projection.bins;
         let view = View::new(&self.projection.camera);
         let mut g = GaussiansGrad::zeros(n);
+        g.factors = vec![LowerFactor::default(); self.gaussians.factors.len()];
+        let mut factor_pieces: Vec<&mut [LowerFactor]> = g.factors.chunks_mut(CHUNK).collect();
+        factor_pieces.resize_with(n.div_ceil(CHUNK), Default::default);
         let mut screen = vec![Vec2::ZERO; n];
         let mut d_features = vec![0.0; n * channels];
         let mut feature_pieces: Vec<&mut [f32]> = d_features.chunks_mut((CHUNK * channels).max(1)).collect();
@@ -278,13 +281,14 @@ impl RasterPullback<'_> {
             g.means.par_chunks_mut(CHUNK),
             g.scales.par_chunks_mut(CHUNK),
             g.rotations.par_chunks_mut(CHUNK),
+            factor_pieces,
             g.opacities.par_chunks_mut(CHUNK),
             screen.par_chunks_mut(CHUNK),
             feature_pieces,
         )
             .into_par_iter()
             .enumerate()
-            .for_each(|(run, (means, scales, rotations, opacities, screen, d_features))| {
+            .for_each(|(run, (means, scales, rotations, factors, opacities, screen, d_features))| {
                 let splats = &bins.runs[run].splats;
                 let mut sums = vec![0.0f32; splats.len() * line];
                 bins.for_each_place(run, |splat, region, slot| {
@@ -298,6 +302,9 @@ impl RasterPullback<'_> {
                     let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
                     let d = project_pull(self.gaussians, gaussian, &view, &footprint);
                     (means[i], scales[i], rotations[i]) = (d.mean, d.scale, d.rotation);
+                    if let Some(factor) = factors.get_mut(i) {
+                        *factor = d.factor;
+                    }
                     opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
                     screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
                     d_features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);

@@ -42,13 +42,6 @@ pub const SPLAT_PARAMETERS: usize = 11;
 /// `[eq:ewa-projection]`.
 pub fn project_splat<R: Real>(g: &[R], camera: &SplatCamera, rules: &SplatRules) -> Option<([R; 2], [R; 3], R)> {
     let of = R::of;
-    let p: Vec<R> = (0..3)
-        .map(|r| (0..3).fold(of(camera.translation[r]), |sum, c| sum + of(camera.rotation[r][c]) * g[c]))
-        .collect();
-    let z = p[2];
-    if z.value() <= rules.near {
-        return None;
-    }
     let norm = (g[6] * g[6] + g[7] * g[7] + g[8] * g[8] + g[9] * g[9]).sqrt();
     let [x, y, zq, w] = [g[6] / norm, g[7] / norm, g[8] / norm, g[9] / norm];
     let (one, two) = (of(1.0), of(2.0));
@@ -60,8 +53,28 @@ pub fn project_splat<R: Real>(g: &[R], camera: &SplatCamera, rules: &SplatRules)
     // World covariance, then camera covariance.
     let sum = |f: &dyn Fn(usize) -> R| f(0) + f(1) + f(2);
     let world = |r: usize, c: usize| sum(&|k| q[r][k] * g[3 + k] * g[3 + k] * q[c][k]);
+    let world = std::array::from_fn(|r| std::array::from_fn(|c| world(r, c)));
+    project_covariance(&g[..3], &world, camera, rules)
+}
+
+/// As [`project_splat`], for a Gaussian that is given by its mean and world covariance `[eq:lower-factor]`.
+pub fn project_covariance<R: Real>(
+    mean: &[R],
+    world: &[[R; 3]; 3],
+    camera: &SplatCamera,
+    rules: &SplatRules,
+) -> Option<([R; 2], [R; 3], R)> {
+    let of = R::of;
+    let p: Vec<R> = (0..3)
+        .map(|r| (0..3).fold(of(camera.translation[r]), |sum, c| sum + of(camera.rotation[r][c]) * mean[c]))
+        .collect();
+    let z = p[2];
+    if z.value() <= rules.near {
+        return None;
+    }
+    let sum = |f: &dyn Fn(usize) -> R| f(0) + f(1) + f(2);
     let view =
-        |r: usize, c: usize| sum(&|i| sum(&|j| of(camera.rotation[r][i]) * world(i, j) * of(camera.rotation[c][j])));
+        |r: usize, c: usize| sum(&|i| sum(&|j| of(camera.rotation[r][i]) * world[i][j] * of(camera.rotation[c][j])));
     // The Jacobian of the perspective map, with the tangent clamped to 15 % of the image beyond its border.
     let jacobian: Vec<[R; 3]> = (0..2)
         .map(|a| {

@@ -168,6 +168,7 @@ fn read_scene(path: &Path) -> Result<(Gaussians, Vec<f32>), String> {
         scales: vec3(3 * n),
         rotations: values[6 * n..10 * n].chunks_exact(4).map(|q| Quat::from_xyzw(q[1], q[2], q[3], q[0])).collect(),
         opacities: values[10 * n..11 * n].to_vec(),
+        factors: Vec::new(),
     };
     Ok((gaussians, values[11 * n..].to_vec()))
 }

@@ -166,6 +166,7 @@ impl SplatPly {
                 .collect(),
             rotations: self.rotations.clone(),
             opacities: self.opacity_logits.iter().map(|&v| sigmoid(v)).collect(),
+            factors: Vec::new(),
         }
     }
 
