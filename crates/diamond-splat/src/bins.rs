@@ -32,13 +32,26 @@ impl Span {
         if first + start < past { Span(((past - 1 - start) | first << 4) as u8) } else { Span::NONE }
     }
 
-    /// First and one past last.
+    /// A bit per block.
     #[inline(always)]
-    fn range(self) -> Range<usize> {
-        let last = (self.0 & 15) as usize;
-        (self.0 >> 4) as usize..last + 1
+    fn mask(self) -> u16 {
+        MASKS[self.0 as usize]
     }
 }
+
+/// [`Span::mask`] by the span's number.
+const MASKS: [u16; 256] = {
+    let mut masks = [0; 256];
+    let mut k = 0;
+    while k < 256 {
+        let (first, last) = (k >> 4, k & 15);
+        if first <= last {
+            masks[k] = (((2u32 << last) - 1) & !((1u32 << first) - 1)) as u16;
+        }
+        k += 1;
+    }
+    masks
+};
 
 /// A splat in a region: all that the kernels need to know of it, so that a region reads one stretch of memory per run
 /// and nothing from elsewhere. A cache line.
@@ -232,13 +245,41 @@ pub(crate) struct Scratch {
     /// By slot: features, depth, zeros up to the stride.
     pub features: Vec<f32>,
     sorter: Sorter,
-    /// By slot, once more: in the order of depth it is read at random.
-    spans: Vec<[Span; ROWS]>,
-    /// Entries of block `b` are `start[b]..start[b + 1]`, blocks row by row.
-    start: Vec<u32>,
-    next: Vec<u32>,
-    /// Slots, per block in depth order.
-    entries: Vec<u32>,
+    /// Who meets which block: a bit per slot, in order of depth, [`WORD`] of them in a number; by number, band, column.
+    bits: Vec<[[u64; COLUMNS]; ROWS]>,
+}
+
+/// Slots per number of [`Scratch::bits`].
+const WORD: usize = 64;
+
+/// The transpose of a matrix of 8 × 8 bits, a row per byte.
+#[inline(always)]
+fn transpose_bits(mut x: u64) -> u64 {
+    // Swaps the off-diagonal quarters of ever larger blocks: of 2 × 2 bits, then 4 × 4, then 8 × 8.
+    for (shift, mask) in [(7, 0x00AA_00AA_00AA_00AA), (14, 0x0000_CCCC_0000_CCCC), (28, 0x0000_0000_F0F0_F0F0)] {
+        let t = (x ^ (x >> shift)) & mask;
+        x ^= t ^ (t << shift);
+    }
+    x
+}
+
+/// For each of the sixteen columns of a band, which of these slots meet it.
+#[inline(always)]
+fn columns_of(masks: &[u16; WORD]) -> [u64; COLUMNS] {
+    let mut columns = [[0u8; 8]; COLUMNS];
+    for (group, masks) in masks.as_chunks::<8>().0.iter().enumerate() {
+        for half in 0..2 {
+            let mut rows = [0u8; 8];
+            for k in 0..8 {
+                rows[k] = (masks[k] >> (8 * half)) as u8;
+            }
+            let transposed = transpose_bits(u64::from_le_bytes(rows)).to_le_bytes();
+            for k in 0..8 {
+                columns[8 * half + k][group] = transposed[k];
+            }
+        }
+    }
+    columns.map(u64::from_le_bytes)
 }
 
 impl Scratch {
@@ -267,47 +308,28 @@ impl Scratch {
         }
     }
 
-    /// Makes the lists of the region that was gathered.
+    /// Finds the order of depth and who meets which block of the region that was gathered.
     #[inline(always)]
     pub fn list(&mut self) {
-        // Counts as running sums of where spans begin and end.
-        const SIZE: usize = COLUMNS + 1;
-        let (mut begins, mut ends) = ([[0u32; SIZE]; ROWS], [[0u32; SIZE]; ROWS]);
         self.sorter.from.clear();
-        self.spans.clear();
         for (slot, at) in (0..).zip(&self.slots) {
             self.sorter.from.push((at.depth.to_bits(), slot));
-            self.spans.push(at.spans);
-            for band in 0..ROWS {
-                let span = at.spans[band].range();
-                begins[band][span.start] += 1;
-                ends[band][span.end] += 1;
-            }
         }
-        self.start.clear();
-        let mut total = 0u32;
-        for band in 0..ROWS {
-            let mut covering = 0u32;
-            for block in 0..COLUMNS {
-                self.start.push(total);
-                // An empty span ends where it begins.
-                covering = covering + begins[band][block] - ends[band][block];
-                total += covering;
-            }
-        }
-        self.start.push(total);
         self.sorter.sort();
-        self.entries.resize(total as usize, 0);
-        self.next.clear();
-        self.next.extend_from_slice(&self.start);
-        for &(_, slot) in &self.sorter.from {
-            let spans = &self.spans[slot as usize];
-            for (span, next) in spans.iter().zip(self.next.chunks_exact_mut(COLUMNS)) {
-                for next in &mut next[span.range()] {
-                    self.entries[*next as usize] = slot;
-                    *next += 1;
+        self.bits.clear();
+        for slots in self.sorter.from.chunks(WORD) {
+            let mut masks = [[0u16; WORD]; ROWS];
+            for (k, &(_, slot)) in slots.iter().enumerate() {
+                let spans = &self.slots[slot as usize].spans;
+                for band in 0..ROWS {
+                    masks[band][k] = spans[band].mask();
                 }
             }
+            let mut bits = [[0; COLUMNS]; ROWS];
+            for band in 0..ROWS {
+                bits[band] = columns_of(&masks[band]);
+            }
+            self.bits.push(bits);
         }
     }
 
@@ -317,15 +339,46 @@ impl Scratch {
         self.slots[slot as usize].ellipse.prepare(x, y)
     }
 
-    /// Number of entries.
-    pub fn entries(&self) -> usize {
-        self.entries.len()
+    /// Number of (slot, block) pairs.
+    pub fn entries(&self) -> u64 {
+        self.bits.as_flattened().as_flattened().iter().map(|bits| bits.count_ones() as u64).sum()
     }
 
-    /// The entries of a block.
+    /// The slots that meet a block, nearest first.
     #[inline(always)]
-    pub fn of(&self, block: usize) -> &[u32] {
-        &self.entries[self.start[block] as usize..self.start[block + 1] as usize]
+    pub fn of(&self, block: usize) -> BlockSlots<'_> {
+        BlockSlots { scratch: self, band: block / COLUMNS, column: block % COLUMNS, word: 0, bits: 0 }
+    }
+}
+
+/// See [`Scratch::of`]. Slots are looked up only when they are asked for: pixels are often saturated long before the end.
+pub(crate) struct BlockSlots<'a> {
+    scratch: &'a Scratch,
+    band: usize,
+    column: usize,
+    word: usize,
+    bits: u64,
+}
+
+impl BlockSlots<'_> {
+    /// Fills `to` with the next slots and returns how many there were.
+    #[inline(always)]
+    pub fn next(&mut self, to: &mut [u32]) -> usize {
+        let order = &self.scratch.sorter.from;
+        let mut n = 0;
+        while n < to.len() {
+            if self.bits == 0 {
+                let Some(bits) = self.scratch.bits.get(self.word) else { break };
+                self.bits = bits[self.band][self.column];
+                self.word += 1;
+                continue;
+            }
+            let k = (self.word - 1) * WORD + self.bits.trailing_zeros() as usize;
+            self.bits &= self.bits - 1;
+            to[n] = order[k].1;
+            n += 1;
+        }
+        n
     }
 }
 
@@ -339,21 +392,24 @@ pub(crate) struct Reached {
 }
 
 impl Reached {
-    /// For so many entries.
+    /// With room for so many entries.
     pub fn with_capacity(entries: usize) -> Self {
         Self { entries: Vec::with_capacity(entries), counts: Vec::with_capacity(ROWS * COLUMNS) }
     }
 
-    /// Appends the entries of the next block.
+    /// Begins the next block.
+    #[inline(always)]
+    pub fn begin(&mut self) {
+        self.counts.push(0);
+    }
+
+    /// Appends entries to the block.
     #[inline(always)]
     pub fn push(&mut self, entries: &[u32]) {
         self.entries.extend_from_slice(entries);
-        self.counts.push(entries.len() as u32);
-    }
-
-    /// Gives back what was reserved too much.
-    pub fn shrink(&mut self) {
-        self.entries.shrink_to_fit();
+        if let Some(count) = self.counts.last_mut() {
+            *count += entries.len() as u32;
+        }
     }
 
     /// The blocks' entries in the order in which they were pushed.
@@ -391,13 +447,23 @@ mod tests {
     #[test]
     fn spans_are_cut_at_the_region() {
         assert_eq!(Span::new((0, 0), 0), Span::NONE);
-        assert!(Span::NONE.range().is_empty());
-        assert_eq!(Span::new((3, 40), 0).range(), 3..16);
-        assert_eq!(Span::new((3, 40), 16).range(), 0..16);
-        assert_eq!(Span::new((3, 40), 32).range(), 0..8);
+        assert_eq!(Span::NONE.mask(), 0);
+        assert_eq!(Span::new((3, 40), 0).mask(), 0xFFF8);
+        assert_eq!(Span::new((3, 40), 16).mask(), 0xFFFF);
+        assert_eq!(Span::new((3, 40), 32).mask(), 0x00FF);
         assert_eq!(Span::new((3, 40), 48), Span::NONE);
         assert_eq!(Span::new((20, 21), 0), Span::NONE);
-        assert_eq!(Span::new((31, 32), 16).range(), 15..16);
+        assert_eq!(Span::new((31, 32), 16).mask(), 0x8000);
+    }
+
+    #[test]
+    fn columns_are_the_transpose_of_masks() {
+        let masks: [u16; WORD] = std::array::from_fn(|k| (k as u32 * 40_503 + 977) as u16);
+        for (c, column) in columns_of(&masks).into_iter().enumerate() {
+            for (k, mask) in masks.iter().enumerate() {
+                assert_eq!(column >> k & 1, (mask >> c & 1) as u64, "column {c}, slot {k}");
+            }
+        }
     }
 
     #[test]
@@ -419,10 +485,17 @@ mod tests {
         let mut scratch = Scratch::default();
         scratch.gather(&bins, 0, &crate::Features { channels: 0, data: Vec::new() }, 8);
         scratch.list();
-        let of = |band: usize| (0..3).map(|b| scratch.of(COLUMNS * band + b).to_vec()).collect::<Vec<_>>();
+        let all = |block: usize| {
+            let (mut slots, mut of) = (vec![0; 5], scratch.of(block));
+            let n = of.next(&mut slots);
+            slots.truncate(n);
+            slots
+        };
+        let of = |band: usize| (0..3).map(|b| all(COLUMNS * band + b)).collect::<Vec<_>>();
+        assert_eq!(scratch.entries(), 20);
         assert_eq!(of(0), [vec![0], vec![2, 0], vec![2]]);
         assert_eq!(of(7), [vec![], vec![0], vec![0, 1]]);
-        assert_eq!(scratch.of(127), [0]);
+        assert_eq!(all(127), [0]);
         let mut places = Vec::new();
         bins.for_each_place(0, |splat, region, slot| places.push((splat, region, slot)));
         assert_eq!(places, [(0, 0, 0), (1, 0, 1), (2, 0, 2)]);

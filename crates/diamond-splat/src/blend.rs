@@ -146,7 +146,7 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
     }
     scratch.list();
     let scratch = &*scratch;
-    let mut lists = Reached::with_capacity(scratch.entries());
+    let mut lists = Reached::with_capacity(8 * scratch.slots.len());
     let [corner_x, corner_y] = scene.corner(region);
     let [width, height] = scene.region_size(region);
     let channels = scene.channels;
@@ -159,27 +159,31 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
     // Sums by channel.
     let mut acc = vec![[0.0f32; LANES]; groups * GROUP];
     let mut prepared = [Prepared::default(); BATCH];
-    // Where a splat's features begin.
+    // Who is blended, and where the features begin.
+    let mut entries = [0u32; BATCH];
     let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
-    let mut work = RegionWork { entries: scratch.entries() as u64, ..Default::default() };
+    let mut work = RegionWork { entries: scratch.entries(), ..Default::default() };
     for block in 0..ROWS * COLUMNS {
-        let all = scratch.of(block);
-        let Some(place) = scene.place(region, block).filter(|_| !all.is_empty()) else {
-            lists.push(&[]);
+        lists.begin();
+        let Some(place) = scene.place(region, block) else {
             continue;
         };
+        let mut slots = scratch.of(block);
+        let mut n = slots.next(&mut entries);
+        if n == 0 {
+            continue;
+        }
         let (x, y) = place.centre();
         let mut t = load::<S, N>(&place.initial_transmittance());
         let mut sum = [s.splat_f32s(0.0); N];
         acc.fill([0.0; LANES]);
-        let mut reach = 0;
-        for (batch, entries) in all.chunks(BATCH).enumerate() {
-            for (k, &slot) in entries.iter().enumerate() {
+        while n > 0 {
+            for k in 0..n {
+                let slot = entries[k];
                 rows[k] = slot as usize * scene.stride;
                 prepared[k] = scratch.prepare(slot, x, y);
             }
-            let n = entries.len();
             work.evaluated += (n * LANES) as u64;
             if let Some(beyond) = prepared.get_mut(n) {
                 *beyond = Prepared::NOTHING;
@@ -225,20 +229,17 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                 let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
                 work.blended += weights[..n].iter().map(positive).sum::<u64>();
             }
-            reach = batch * BATCH + n;
-            if !any_positive::<S, N>(s, &t) {
-                // The last that any pixel saw.
-                while reach > batch * BATCH + 1
-                    && !any_positive::<S, N>(s, &load::<S, N>(&weights[reach - batch * BATCH - 1]))
-                {
-                    reach -= 1;
-                }
-                break;
+            if any_positive::<S, N>(s, &t) {
+                lists.push(&entries[..n]);
+                n = slots.next(&mut entries);
+                continue;
             }
-        }
-        lists.push(&all[..reach]);
-        if reach == 0 {
-            continue;
+            // The last that any pixel saw.
+            while n > 1 && !any_positive::<S, N>(s, &load::<S, N>(&weights[n - 1])) {
+                n -= 1;
+            }
+            lists.push(&entries[..n]);
+            break;
         }
         let mut total = [0.0f32; LANES];
         store::<S, N>(&mut total, sum);
@@ -257,6 +258,5 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
             }
         }
     }
-    lists.shrink();
     RegionImage { data, lists, work }
 }
