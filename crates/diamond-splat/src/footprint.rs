@@ -43,7 +43,7 @@ impl View {
 
 impl View {
     /// World point to camera coordinates.
-    #[inline]
+    #[inline(always)]
     pub fn to_camera(&self, world: Vec3) -> [f64; 3] {
         let [x, y, z] = world.to_array().map(f64::from);
         let row = |r: usize| self.w[r][0] * x + self.w[r][1] * y + self.w[r][2] * z + self.t[r];
@@ -51,7 +51,7 @@ impl View {
     }
 
     /// World axes of a vector in camera axes.
-    #[inline]
+    #[inline(always)]
     fn to_world_axes(&self, d: [f64; 3]) -> [f64; 3] {
         let column = |c: usize| self.w[0][c] * d[0] + self.w[1][c] * d[1] + self.w[2][c] * d[2];
         [column(0), column(1), column(2)]
@@ -78,6 +78,7 @@ pub(crate) struct Linearised {
 
 impl Linearised {
     /// Of Gaussian `i`.
+    #[inline(always)]
     pub fn of(g: &Gaussians, i: usize, view: &View) -> Self {
         let p = view.to_camera(g.means[i]);
         let inv_z = 1.0 / p[2];
@@ -108,6 +109,7 @@ impl Linearised {
 }
 
 /// Normalised x, y, z, w and 1/norm; the identity and 0 where it is too short.
+#[inline(always)]
 fn unit_quaternion(rotation: Quat) -> ([f64; 4], f64) {
     let [qx, qy, qz, qw] = rotation.to_array().map(f64::from);
     let norm2 = qx * qx + qy * qy + qz * qz + qw * qw;
@@ -118,6 +120,7 @@ fn unit_quaternion(rotation: Quat) -> ([f64; 4], f64) {
     ([qx * inv, qy * inv, qz * inv, qw * inv], inv)
 }
 
+#[inline(always)]
 fn rotation_matrix([x, y, z, w]: [f64; 4]) -> [[f64; 3]; 3] {
     [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -127,6 +130,7 @@ fn rotation_matrix([x, y, z, w]: [f64; 4]) -> [[f64; 3]; 3] {
 }
 
 /// Pullback of [`rotation_matrix`] for the four numbers as if they were independent.
+#[inline(always)]
 fn rotation_matrix_pull([x, y, z, w]: [f64; 4], d: [[f64; 3]; 3]) -> [f64; 4] {
     let (s01, s02, s12) = (d[0][1] + d[1][0], d[0][2] + d[2][0], d[1][2] + d[2][1]);
     let (a21, a02, a10) = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]);
@@ -159,6 +163,7 @@ pub(crate) struct GaussianGrad {
 }
 
 /// Pullback of the projection of Gaussian `i` (all but the opacity, which does not move a footprint).
+#[inline(always)]
 pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGrad) -> GaussianGrad {
     let lin = Linearised::of(g, i, view);
     let s = lin.s;
@@ -213,6 +218,7 @@ pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGr
 }
 
 /// To f32 without overflow to infinity: a finite cotangent must give a finite gradient.
+#[inline(always)]
 pub(crate) fn finite_f32(v: f64) -> f32 {
     (v as f32).clamp(f32::MIN, f32::MAX)
 }

@@ -69,6 +69,7 @@ pub(crate) struct Outline {
 }
 
 /// The pixels (first, one past last) whose centres lie within `extent` of `mean`, clamped to `size`.
+#[inline(always)]
 fn pixel_range(mean: f64, extent: f64, size: u32) -> (u32, u32) {
     // `as` saturates, so that infinite and negative ends are clamped.
     ((mean - extent - 0.5).ceil().max(0.0) as u32, ((mean + extent - 0.5).floor() + 1.0).min(size as f64) as u32)
@@ -216,7 +217,9 @@ fn validate_camera(camera: &Camera) -> Result<(), SplatError> {
     Ok(())
 }
 
-/// One Gaussian's splat, `None` where it is culled.
+/// One Gaussian's splat, `None` where it is culled. To be compiled where the instruction set is known: it has roots and
+/// roundings in it.
+#[inline(always)]
 fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> Option<(Splat, Outline)> {
     let opacity = g.opacities[i];
     if opacity < config.min_alpha || opacity <= 0.0 {
@@ -271,6 +274,7 @@ const MAX_COVARIANCE: f64 = 1e30;
 const MAX_DEPTH: f64 = 1e18;
 
 /// Whether all values are numbers of at most that magnitude.
+#[inline(always)]
 fn within(values: &[f64], largest: f64) -> bool {
     values.iter().all(|v| v.abs() <= largest)
 }

@@ -9,7 +9,7 @@ use crate::pullback::{GEOMETRY, RegionBackward};
 use crate::{Features, Gaussians, GaussiansGrad, LowerFactor, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
-use glam::Vec2;
+use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -267,7 +267,6 @@ impl RasterPullback<'_> {
         let n = self.gaussians.len();
         let channels = self.features.channels;
         let line = GEOMETRY + stride(channels, self.level);
-        let bins = &self.projection.bins;
         let view = View::new(&self.projection.camera);
         let mut g = GaussiansGrad::zeros(n);
         g.factors = vec![LowerFactor::default(); self.gaussians.factors.len()];
@@ -288,34 +287,70 @@ impl RasterPullback<'_> {
         )
             .into_par_iter()
             .enumerate()
-            .for_each(|(run, (means, scales, rotations, factors, opacities, screen, d_features))| {
-                let splats = &bins.runs[run].splats;
-                let mut sums = vec![0.0f32; splats.len() * line];
-                bins.for_each_place(run, |splat, region, slot| {
-                    let from = &parts[region][slot * line..][..line];
-                    sums[splat * line..][..line].iter_mut().zip(from).for_each(|(a, b)| *a += b);
-                });
-                for (splat, sums) in splats.iter().zip(sums.chunks_exact(line)) {
-                    let gaussian = splat.gaussian as usize;
-                    let i = gaussian - run * CHUNK;
-                    let (moments, features) = sums.split_at(GEOMETRY);
-                    let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
-                    let d = project_pull(self.gaussians, gaussian, &view, &footprint);
-                    (means[i], scales[i], rotations[i]) = (d.mean, d.scale, d.rotation);
-                    if let Some(factor) = factors.get_mut(i) {
-                        *factor = d.factor;
-                    }
-                    opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
-                    screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
-                    d_features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);
-                }
+            .for_each(|(run, (means, scales, rotations, factors, opacities, screen, features))| {
+                let to = RunGrad { means, scales, rotations, factors, opacities, screen, features };
+                self.level.dispatch(GatherRun { pullback: self, parts, view: &view, line, run, to });
             });
         RasterPull { gaussians: g, features: d_features, screen }
     }
 }
 
+/// Where the gradient of one run's Gaussians goes.
+struct RunGrad<'a> {
+    means: &'a mut [Vec3],
+    scales: &'a mut [Vec3],
+    rotations: &'a mut [Vec4],
+    factors: &'a mut [LowerFactor],
+    opacities: &'a mut [f32],
+    screen: &'a mut [Vec2],
+    features: &'a mut [f32],
+}
+
+/// The gradient of one run, compiled for the instruction set.
+struct GatherRun<'a> {
+    pullback: &'a RasterPullback<'a>,
+    /// By region: slots × line.
+    parts: &'a [Vec<f32>],
+    view: &'a View,
+    line: usize,
+    run: usize,
+    to: RunGrad<'a>,
+}
+
+impl pulp::WithSimd for GatherRun<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let GatherRun { pullback, parts, view, line, run, to } = self;
+        let bins = &pullback.projection.bins;
+        let channels = pullback.features.channels;
+        let splats = &bins.runs[run].splats;
+        let mut sums = vec![0.0f32; splats.len() * line];
+        bins.for_each_place(run, |splat, region, slot| {
+            let from = &parts[region][slot * line..][..line];
+            sums[splat * line..][..line].iter_mut().zip(from).for_each(|(a, b)| *a += b);
+        });
+        for (splat, sums) in splats.iter().zip(sums.chunks_exact(line)) {
+            let gaussian = splat.gaussian as usize;
+            let i = gaussian - run * CHUNK;
+            let (moments, features) = sums.split_at(GEOMETRY);
+            let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
+            let d = project_pull(pullback.gaussians, gaussian, view, &footprint);
+            (to.means[i], to.scales[i], to.rotations[i]) = (d.mean, d.scale, d.rotation);
+            if let Some(factor) = to.factors.get_mut(i) {
+                *factor = d.factor;
+            }
+            to.opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
+            to.screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
+            to.features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);
+        }
+    }
+}
+
 /// Whitened moments to the cotangent of mean and covariance `[eq:splat-footprint-pull]`:
 /// `d/d mean = L Σ g w`, `d/d Σ = ½ L (Σ g w wᵀ) Lᵀ` with `w = Lᵀd`.
+#[inline(always)]
 fn footprint_grad(moments: &[f32], [l11, l21, l22]: [f64; 3], d_depth: f64) -> FootprintGrad {
     let (inv, half) = (1.0 / KAPPA2.sqrt(), 0.5 / KAPPA2);
     let [u, v] = [moments[1], moments[2]].map(|m| m as f64 * inv);
