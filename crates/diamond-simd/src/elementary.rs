@@ -50,15 +50,40 @@ fn scale_by_power<S: Simd>(s: S, p: S::f32s, shifted: S::f32s) -> S::f32s {
 /// 2^t for t ≤ 127 on a bare vector, relative error 2.5e-7; at or below −126 the smallest normal number.
 #[inline(always)]
 pub fn exp2_of<S: Simd>(s: S, t: S::f32s) -> S::f32s {
-    let t = s.max_f32s(t, s.splat_f32s(MIN_EXPONENT));
-    let magic = s.splat_f32s(ROUND_MAGIC);
-    let shifted = s.add_f32s(t, magic);
-    let f = s.sub_f32s(t, s.sub_f32s(shifted, magic));
-    let mut p = s.splat_f32s(EXP2[0]);
-    for c in &EXP2[1..] {
-        p = s.mul_add_e_f32s(p, f, s.splat_f32s(*c));
+    exp2_of_all(s, [[t]])[0][0]
+}
+
+/// [`exp2_of`] of many vectors at once: each constant is loaded once for all of them.
+#[inline(always)]
+pub fn exp2_of_all<S: Simd, const N: usize, const M: usize>(s: S, t: [[S::f32s; N]; M]) -> [[S::f32s; N]; M] {
+    let (lowest, magic) = (s.splat_f32s(MIN_EXPONENT), s.splat_f32s(ROUND_MAGIC));
+    let (mut shifted, mut f, mut p) = (t, t, t);
+    for m in 0..M {
+        for i in 0..N {
+            f[m][i] = s.max_f32s(t[m][i], lowest);
+        }
     }
-    scale_by_power(s, p, shifted)
+    for m in 0..M {
+        for i in 0..N {
+            shifted[m][i] = s.add_f32s(f[m][i], magic);
+            f[m][i] = s.sub_f32s(f[m][i], s.sub_f32s(shifted[m][i], magic));
+            p[m][i] = s.splat_f32s(EXP2[0]);
+        }
+    }
+    for c in &EXP2[1..] {
+        let c = s.splat_f32s(*c);
+        for m in 0..M {
+            for i in 0..N {
+                p[m][i] = s.mul_add_e_f32s(p[m][i], f[m][i], c);
+            }
+        }
+    }
+    for m in 0..M {
+        for i in 0..N {
+            p[m][i] = scale_by_power(s, p[m][i], shifted[m][i]);
+        }
+    }
+    p
 }
 
 /// 2^t, relative error 2.5e-7; t is cut to [−126, 127].
@@ -230,7 +255,9 @@ mod tests {
     }
 
     /// (function, points, truth, size of the allowed error at a true value, allowed error in that unit)
-    fn cases() -> Vec<(Function, Vec<f32>, fn(f64) -> f64, fn(f64) -> f64, f64)> {
+    type Exact = fn(f64) -> f64;
+
+    fn cases() -> Vec<(Function, Vec<f32>, Exact, Exact, f64)> {
         let even = |from: f32, to: f32| -> Vec<f32> {
             (0..40_001).map(|i| from + (to - from) * (i as f32 / 40_000.0)).collect()
         };

@@ -51,7 +51,7 @@ mod lanes;
 mod level;
 
 pub use block::{BLOCK, Block, any_positive, load_block, store_block, sum_block, tree_sum};
-pub use elementary::{exp, exp2, exp2_of, ln, ln_1p_exp, log2, root_2_2, root_2_4, sigmoid, sin_cos_pi};
+pub use elementary::{exp, exp2, exp2_of, exp2_of_all, ln, ln_1p_exp, log2, root_2_2, root_2_4, sigmoid, sin_cos_pi};
 pub use instruction_set::{ENVIRONMENT_VARIABLE, InstructionSet, InstructionSetError, current, fix, from_environment};
 pub use lanes::{Lanes, Mask};
 pub use level::Level;

@@ -7,7 +7,7 @@
 //! large sort, because everything that is read then lies close together.
 use crate::ellipse::{BANDS, BLOCK, Ellipse, Prepared, band_spans, block_span};
 use crate::projection::{Outline, Splat};
-use pulp::Simd;
+use diamond_simd::Simd;
 use std::ops::Range;
 
 /// Blocks of a region side by side. At most 16: a span is two numbers of four bits.
@@ -432,8 +432,8 @@ mod tests {
     fn sorting_keeps_ties_by_index() {
         let depths = [3.0f32, 0.5, 1e-30, 3.0, 7e20, 0.5, 0.500_000_06, 1.0];
         for n in [0, 5, 8, 300, 5000] {
-            let mut sorter = Sorter::default();
-            sorter.from = (0..n).map(|i| (depths[i as usize * 5 % 8].to_bits(), i)).collect();
+            let from = (0..n).map(|i| (depths[i as usize * 5 % 8].to_bits(), i)).collect();
+            let mut sorter = Sorter { from, ..Default::default() };
             let mut expected = sorter.from.clone();
             expected.sort();
             sorter.sort();

@@ -6,8 +6,8 @@
 use crate::Features;
 use crate::bins::{Bins, COLUMNS, REGION, ROWS, Reached, Scratch, grid};
 use crate::ellipse::{BLOCK, LANES, Prepared};
-use crate::lanes::{Block, Limits, Offsets, Thresholds, alphas, any_positive, composite, load, store, with_lanes};
-use pulp::{Simd, WithSimd};
+use crate::lanes::{Limits, Offsets, Thresholds, alphas, composite};
+use diamond_simd::{Block, Simd, WithSimd, any_positive, load_block, store_block, with_lanes};
 
 /// Entries of a block that are prepared and blended together.
 const BATCH: usize = 32;
@@ -175,7 +175,7 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
             continue;
         }
         let (x, y) = place.centre();
-        let mut t = load::<S, N>(&place.initial_transmittance());
+        let mut t = load_block::<S, N>(&place.initial_transmittance());
         let mut sum = [s.splat_f32s(0.0); N];
         acc.fill([0.0; LANES]);
         while n > 0 {
@@ -194,12 +194,12 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                 let (a, _) = alphas::<S, N, TOGETHER, SMOOTH>(s, splats, &offsets, &limits);
                 for m in 0..TOGETHER {
                     let w = composite::<S, N>(s, &a[m], &mut t, &limits);
-                    store::<S, N>(&mut weights[m], w);
+                    store_block::<S, N>(&mut weights[m], w);
                 }
             }
             // Phase 2: Σ w and Σ w f.
             for m in 0..n {
-                let w = load::<S, N>(&weights[m]);
+                let w = load_block::<S, N>(&weights[m]);
                 for i in 0..N {
                     sum[i] = s.add_f32s(sum[i], w[i]);
                 }
@@ -208,10 +208,10 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                 let acc = &mut acc[group * GROUP..][..GROUP];
                 let mut sums: [Block<S, N>; GROUP] = [[limits.zero; N]; GROUP];
                 for c in 0..GROUP {
-                    sums[c] = load::<S, N>(&acc[c]);
+                    sums[c] = load_block::<S, N>(&acc[c]);
                 }
                 for (w, row) in weights[..n].iter().zip(&rows) {
-                    let w = load::<S, N>(w);
+                    let w = load_block::<S, N>(w);
                     let at = row + group * GROUP;
                     let f = &scratch.features[at..at + GROUP];
                     for c in 0..GROUP {
@@ -222,7 +222,7 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                     }
                 }
                 for c in 0..GROUP {
-                    store::<S, N>(&mut acc[c], sums[c]);
+                    store_block::<S, N>(&mut acc[c], sums[c]);
                 }
             }
             if scene.count {
@@ -235,14 +235,14 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                 continue;
             }
             // The last that any pixel saw.
-            while n > 1 && !any_positive::<S, N>(s, &load::<S, N>(&weights[n - 1])) {
+            while n > 1 && !any_positive::<S, N>(s, &load_block::<S, N>(&weights[n - 1])) {
                 n -= 1;
             }
             lists.push(&entries[..n]);
             break;
         }
         let mut total = [0.0f32; LANES];
-        store::<S, N>(&mut total, sum);
+        store_block::<S, N>(&mut total, sum);
         for line in 0..place.size[1] {
             let first = (place.y - corner_y + line) * width + place.x - corner_x;
             let (lanes, pixels) = (line * BLOCK..line * BLOCK + place.size[0], first..first + place.size[0]);

@@ -5,7 +5,7 @@
 //! error in f32 stays near 1e-7 even on long thin ellipses, where the usual `½(A dx² + C dy²) + B dx dy` loses four
 //! digits by cancellation.
 use crate::projection::{Outline, Splat};
-use pulp::Simd;
+use diamond_simd::Simd;
 
 /// Side of a block, pixels. Blocks are what splats are binned to: on a processor, work that no pixel needs costs more
 /// than longer lists do.
@@ -140,11 +140,11 @@ pub(crate) fn block_span(low: f32, high: f32, blocks: f32) -> (u16, u16) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lanes::Level;
+    use diamond_simd::Level;
 
     struct Band(Splat, Outline);
 
-    impl pulp::WithSimd for Band {
+    impl diamond_simd::WithSimd for Band {
         type Output = ([f32; LANES], [f32; LANES]);
         #[inline(always)]
         fn with_simd<S: Simd>(self, s: S) -> Self::Output {
@@ -175,7 +175,7 @@ mod tests {
             let two_tau = 11.0 * r(6);
             let rightmost = (b / a) as f32 * splat.extent[0];
             let outline = Outline { two_tau: two_tau as f32, rightmost, ..Default::default() };
-            let (low, high) = Level::native().dispatch(Band(moved, outline));
+            let (low, high) = Level::current().dispatch(Band(moved, outline));
             let (lo, hi) = (low[0], high[0]);
             let (mut seen_lo, mut seen_hi) = (f64::MAX, f64::MIN);
             for k in 0..=3000 {

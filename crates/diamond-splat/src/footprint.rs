@@ -1,7 +1,8 @@
 //! The map from one Gaussian to its footprint on screen, in f64, and its pullback.
+use crate::wide::{WIDTH, Wide};
 use crate::{Gaussians, LowerFactor};
 use diamond_camera::Camera;
-use glam::{Quat, Vec3, Vec4};
+use glam::{Vec3, Vec4};
 
 /// How far beyond the image, as a fraction of the half field of view, the linearisation point may lie. Farther out the
 /// tangent x/z is clamped, because the linear map there would smear a Gaussian over the whole image.
@@ -42,103 +43,133 @@ impl View {
 }
 
 impl View {
-    /// World point to camera coordinates.
+    /// World points to camera coordinates.
     #[inline(always)]
-    pub fn to_camera(&self, world: Vec3) -> [f64; 3] {
-        let [x, y, z] = world.to_array().map(f64::from);
-        let row = |r: usize| self.w[r][0] * x + self.w[r][1] * y + self.w[r][2] * z + self.t[r];
-        [row(0), row(1), row(2)]
+    pub fn to_camera(&self, [x, y, z]: [Wide; 3]) -> [Wide; 3] {
+        let mut p = [x; 3];
+        for r in 0..3 {
+            p[r] = x * self.w[r][0] + y * self.w[r][1] + z * self.w[r][2] + Wide::of(self.t[r]);
+        }
+        p
     }
 
-    /// World axes of a vector in camera axes.
+    /// World axes of vectors in camera axes.
     #[inline(always)]
-    fn to_world_axes(&self, d: [f64; 3]) -> [f64; 3] {
-        let column = |c: usize| self.w[0][c] * d[0] + self.w[1][c] * d[1] + self.w[2][c] * d[2];
-        [column(0), column(1), column(2)]
+    fn to_world_axes(&self, d: [Wide; 3]) -> [Wide; 3] {
+        let mut out = d;
+        for c in 0..3 {
+            out[c] = d[0] * self.w[0][c] + d[1] * self.w[1][c] + d[2] * self.w[2][c];
+        }
+        out
     }
 }
 
-/// The intermediate values of one projection that its pullback needs as well.
+/// Indices of Gaussians that are worked on together.
+pub(crate) type Four = [usize; WIDTH];
+
+/// A component of these Gaussians.
+#[inline(always)]
+fn gather<T, const N: usize>(of: &[T], four: Four, numbers: impl Fn(&T) -> [f32; N]) -> [Wide; N] {
+    let mut out = [Wide::ZERO; N];
+    for k in 0..WIDTH {
+        let numbers = numbers(&of[four[k]]);
+        for c in 0..N {
+            out[c].0[k] = numbers[c] as f64;
+        }
+    }
+    out
+}
+
+/// The means of these Gaussians.
+#[inline(always)]
+pub(crate) fn means(g: &Gaussians, four: Four) -> [Wide; 3] {
+    gather(&g.means, four, Vec3::to_array)
+}
+
+/// The intermediate values of four projections that their pullback needs as well.
 pub(crate) struct Linearised {
     /// Mean in camera coordinates.
-    pub p: [f64; 3],
-    /// Clamped x/z, y/z of the linearisation point, and whether the clamp was inactive.
-    tangent: [f64; 2],
-    free: [bool; 2],
+    pub p: [Wide; 3],
+    /// 1/z.
+    pub inv_z: Wide,
+    /// Clamped x/z, y/z of the linearisation point, and 1 where the clamp was inactive, else 0.
+    tangent: [Wide; 2],
+    free: [Wide; 2],
     /// Unit quaternion x, y, z, w and 1/norm (0 where it counts as the identity).
-    q: [f64; 4],
-    inv_norm: f64,
+    q: [Wide; 4],
+    inv_norm: Wide,
     /// Rotation of the Gaussian in camera axes; its lower factor in camera axes where it has one.
-    v: [[f64; 3]; 3],
+    v: [[Wide; 3]; 3],
     /// Standard deviations; ones where it has a lower factor.
-    s: [f64; 3],
+    s: [Wide; 3],
     /// A = J · W · R_q · diag(s), or J · W · L, 2 × 3.
-    pub a: [[f64; 3]; 2],
+    pub a: [[Wide; 3]; 2],
 }
 
 impl Linearised {
-    /// Of Gaussian `i`.
+    /// Of these Gaussians.
     #[inline(always)]
-    pub fn of(g: &Gaussians, i: usize, view: &View) -> Self {
-        let p = view.to_camera(g.means[i]);
-        let inv_z = 1.0 / p[2];
+    pub fn of(g: &Gaussians, four: Four, view: &View) -> Self {
+        let p = view.to_camera(means(g, four));
+        let inv_z = p[2].recip();
         let raw = [p[0] * inv_z, p[1] * inv_z];
         let [x, y] = view.limits;
-        let tangent = [raw[0].max(x[0]).min(x[1]), raw[1].max(y[0]).min(y[1])];
-        let free = [tangent[0] == raw[0], tangent[1] == raw[1]];
-        let (q, inv_norm) = unit_quaternion(g.rotations[i]);
-        let (root, s) = match g.factors.get(i) {
-            Some(factor) => (factor.matrix(), [1.0; 3]),
-            None => (rotation_matrix(q), g.scales[i].to_array().map(f64::from)),
+        let tangent = [raw[0].clamp(x[0], x[1]), raw[1].clamp(y[0], y[1])];
+        let free = [tangent[0].equals(raw[0]), tangent[1].equals(raw[1])];
+        let (q, inv_norm) = unit_quaternion(gather(&g.rotations, four, |q| q.to_array()));
+        let (root, s) = if g.factors.is_empty() {
+            (rotation_matrix(q), gather(&g.scales, four, Vec3::to_array))
+        } else {
+            let [xx, yx, yy, zx, zy, zz] = gather(&g.factors, four, |factor| factor.0);
+            let zero = Wide::ZERO;
+            ([[xx, zero, zero], [yx, yy, zero], [zx, zy, zz]], [Wide::of(1.0); 3])
         };
-        let mut v = [[0.0; 3]; 3];
+        let mut v = root;
         for r in 0..3 {
             for c in 0..3 {
-                v[r][c] = view.w[r][0] * root[0][c] + view.w[r][1] * root[1][c] + view.w[r][2] * root[2][c];
+                v[r][c] = root[0][c] * view.w[r][0] + root[1][c] * view.w[r][1] + root[2][c] * view.w[r][2];
             }
         }
-        let mut a = [[0.0; 3]; 2];
+        let mut a = [[Wide::ZERO; 3]; 2];
         for axis in 0..2 {
-            let k = view.f[axis] * inv_z;
+            let k = inv_z * view.f[axis];
             for j in 0..3 {
                 a[axis][j] = k * (v[axis][j] - tangent[axis] * v[2][j]) * s[j];
             }
         }
-        Self { p, tangent, free, q, inv_norm, v, s, a }
+        Self { p, inv_z, tangent, free, q, inv_norm, v, s, a }
     }
 }
 
 /// Normalised x, y, z, w and 1/norm; the identity and 0 where it is too short.
 #[inline(always)]
-fn unit_quaternion(rotation: Quat) -> ([f64; 4], f64) {
-    let [qx, qy, qz, qw] = rotation.to_array().map(f64::from);
-    let norm2 = qx * qx + qy * qy + qz * qz + qw * qw;
-    if norm2 < MIN_QUATERNION_NORM2 {
-        return ([0.0, 0.0, 0.0, 1.0], 0.0);
-    }
-    let inv = 1.0 / norm2.sqrt();
-    ([qx * inv, qy * inv, qz * inv, qw * inv], inv)
+fn unit_quaternion([x, y, z, w]: [Wide; 4]) -> ([Wide; 4], Wide) {
+    let norm2 = x * x + y * y + z * z + w * w;
+    let inv = norm2.sqrt().recip();
+    let or = |value: Wide, otherwise: f64| norm2.choose(MIN_QUATERNION_NORM2, value, Wide::of(otherwise));
+    ([or(x * inv, 0.0), or(y * inv, 0.0), or(z * inv, 0.0), or(w * inv, 1.0)], or(inv, 0.0))
 }
 
 #[inline(always)]
-fn rotation_matrix([x, y, z, w]: [f64; 4]) -> [[f64; 3]; 3] {
+fn rotation_matrix([x, y, z, w]: [Wide; 4]) -> [[Wide; 3]; 3] {
+    let one = Wide::of(1.0);
     [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        [one - (y * y + z * z) * 2.0, (x * y - w * z) * 2.0, (x * z + w * y) * 2.0],
+        [(x * y + w * z) * 2.0, one - (x * x + z * z) * 2.0, (y * z - w * x) * 2.0],
+        [(x * z - w * y) * 2.0, (y * z + w * x) * 2.0, one - (x * x + y * y) * 2.0],
     ]
 }
 
 /// Pullback of [`rotation_matrix`] for the four numbers as if they were independent.
 #[inline(always)]
-fn rotation_matrix_pull([x, y, z, w]: [f64; 4], d: [[f64; 3]; 3]) -> [f64; 4] {
+fn rotation_matrix_pull([x, y, z, w]: [Wide; 4], d: [[Wide; 3]; 3]) -> [Wide; 4] {
     let (s01, s02, s12) = (d[0][1] + d[1][0], d[0][2] + d[2][0], d[1][2] + d[2][1]);
     let (a21, a02, a10) = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]);
     [
-        2.0 * (y * s01 + z * s02 - 2.0 * x * (d[1][1] + d[2][2]) + w * a21),
-        2.0 * (x * s01 + z * s12 - 2.0 * y * (d[0][0] + d[2][2]) + w * a02),
-        2.0 * (x * s02 + y * s12 - 2.0 * z * (d[0][0] + d[1][1]) + w * a10),
-        2.0 * (x * a21 + y * a02 + z * a10),
+        (y * s01 + z * s02 - x * (d[1][1] + d[2][2]) * 2.0 + w * a21) * 2.0,
+        (x * s01 + z * s12 - y * (d[0][0] + d[2][2]) * 2.0 + w * a02) * 2.0,
+        (x * s02 + y * s12 - z * (d[0][0] + d[1][1]) * 2.0 + w * a10) * 2.0,
+        (x * a21 + y * a02 + z * a10) * 2.0,
     ]
 }
 
@@ -153,7 +184,8 @@ pub(crate) struct FootprintGrad {
     pub depth: f64,
 }
 
-/// Gradient of the four parameters of one Gaussian, in f64.
+/// Gradient of the parameters of one Gaussian.
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct GaussianGrad {
     pub mean: Vec3,
     pub scale: Vec3,
@@ -162,59 +194,76 @@ pub(crate) struct GaussianGrad {
     pub factor: LowerFactor,
 }
 
-/// Pullback of the projection of Gaussian `i` (all but the opacity, which does not move a footprint).
+/// Pullback of the projection of these Gaussians (all but the opacity, which does not move a footprint).
 #[inline(always)]
-pub(crate) fn project_pull(g: &Gaussians, i: usize, view: &View, d: &FootprintGrad) -> GaussianGrad {
-    let lin = Linearised::of(g, i, view);
+pub(crate) fn project_pull(
+    g: &Gaussians,
+    four: Four,
+    view: &View,
+    d: &[FootprintGrad; WIDTH],
+) -> [GaussianGrad; WIDTH] {
+    let lin = Linearised::of(g, four, view);
     let s = lin.s;
-    let inv_z = 1.0 / lin.p[2];
-    let k = [view.f[0] * inv_z, view.f[1] * inv_z];
-    let mut d_p = [0.0, 0.0, d.depth];
-    let mut d_v = [[0.0; 3]; 3];
-    let mut d_s = [0.0; 3];
+    let inv_z = lin.inv_z;
+    let k = [inv_z * view.f[0], inv_z * view.f[1]];
+    let (mut d_mean2, mut d_cov, mut d_depth) = ([Wide::ZERO; 2], [Wide::ZERO; 3], Wide::ZERO);
+    for lane in 0..WIDTH {
+        (0..2).for_each(|c| d_mean2[c].0[lane] = d[lane].mean[c]);
+        (0..3).for_each(|c| d_cov[c].0[lane] = d[lane].cov[c]);
+        d_depth.0[lane] = d[lane].depth;
+    }
+    let mut d_p = [Wide::ZERO, Wide::ZERO, d_depth];
+    let mut d_v = [[Wide::ZERO; 3]; 3];
+    let mut d_s = [Wide::ZERO; 3];
     for axis in 0..2 {
         // d loss / d A = 2 · dΣ · A.
-        let (same, cross) = (d.cov[2 * axis], d.cov[1]);
-        let (mut d_tangent, mut d_k) = (0.0, 0.0);
+        let (same, cross) = (d_cov[2 * axis], d_cov[1]);
+        let (mut d_tangent, mut d_k) = (Wide::ZERO, Wide::ZERO);
         for j in 0..3 {
-            let d_a = 2.0 * (same * lin.a[axis][j] + cross * lin.a[1 - axis][j]);
+            let d_a = (same * lin.a[axis][j] + cross * lin.a[1 - axis][j]) * 2.0;
             let ray = lin.v[axis][j] - lin.tangent[axis] * lin.v[2][j];
-            d_v[axis][j] += d_a * k[axis] * s[j];
-            d_v[2][j] -= d_a * k[axis] * lin.tangent[axis] * s[j];
-            d_s[j] += d_a * k[axis] * ray;
-            d_tangent -= d_a * k[axis] * lin.v[2][j] * s[j];
+            let scaled = d_a * k[axis];
+            d_v[axis][j] += scaled * s[j];
+            d_v[2][j] -= scaled * lin.tangent[axis] * s[j];
+            d_s[j] += scaled * ray;
+            d_tangent -= scaled * lin.v[2][j] * s[j];
             d_k += d_a * ray * s[j];
         }
         d_p[2] -= d_k * k[axis] * inv_z;
-        let mut d_ratio = d.mean[axis] * view.f[axis];
-        if lin.free[axis] {
-            d_ratio += d_tangent;
-        }
+        let d_ratio = d_mean2[axis] * view.f[axis] + lin.free[axis] * d_tangent;
         d_p[axis] += d_ratio * inv_z;
         d_p[2] -= d_ratio * lin.p[axis] * inv_z * inv_z;
     }
     let d_mean = view.to_world_axes(d_p);
-    let mut d_root = [[0.0; 3]; 3];
+    let mut d_root = [[Wide::ZERO; 3]; 3];
     for j in 0..3 {
         let column = view.to_world_axes([d_v[0][j], d_v[1][j], d_v[2][j]]);
         for r in 0..3 {
             d_root[r][j] = column[r];
         }
     }
-    let mean = Vec3::from_array(d_mean.map(finite_f32));
+    let mut out = [GaussianGrad::default(); WIDTH];
+    for lane in 0..WIDTH {
+        out[lane].mean = Vec3::from_array(Wide::lane(&d_mean, lane).map(finite_f32));
+    }
     if !g.factors.is_empty() {
-        let factor = LowerFactor::matrix_pull(d_root);
-        return GaussianGrad { mean, scale: Vec3::ZERO, rotation: Vec4::ZERO, factor };
+        for lane in 0..WIDTH {
+            out[lane].factor = LowerFactor::matrix_pull(d_root.map(|row| Wide::lane(&row, lane)));
+        }
+        return out;
     }
     let d_unit = rotation_matrix_pull(lin.q, d_root);
-    let along: f64 = (0..4).map(|c| d_unit[c] * lin.q[c]).sum();
-    let d_q: [f64; 4] = std::array::from_fn(|c| (d_unit[c] - along * lin.q[c]) * lin.inv_norm);
-    GaussianGrad {
-        mean,
-        scale: Vec3::from_array(d_s.map(finite_f32)),
-        rotation: Vec4::from_array(d_q.map(finite_f32)),
-        factor: LowerFactor::default(),
+    let q = lin.q;
+    let along = d_unit[0] * q[0] + d_unit[1] * q[1] + d_unit[2] * q[2] + d_unit[3] * q[3];
+    let mut d_q = d_unit;
+    for c in 0..4 {
+        d_q[c] = (d_unit[c] - along * q[c]) * lin.inv_norm;
     }
+    for lane in 0..WIDTH {
+        out[lane].scale = Vec3::from_array(Wide::lane(&d_s, lane).map(finite_f32));
+        out[lane].rotation = Vec4::from_array(Wide::lane(&d_q, lane).map(finite_f32));
+    }
+    out
 }
 
 /// To f32 without overflow to infinity: a finite cotangent must give a finite gradient.
@@ -229,6 +278,7 @@ mod tests {
     use diamond_camera::{Intrinsics, Pose};
     use diamond_testkit::splat::{SplatCamera, SplatRules, project_covariance, project_splat};
     use diamond_testkit::{Dual, Real, adjoint::relative_l2, vjp};
+    use glam::Quat;
     use proptest::prelude::*;
 
     fn unit() -> impl Strategy<Value = f32> {
@@ -291,7 +341,7 @@ mod tests {
             let mut g = Gaussians::default();
             g.push(Vec3::from_array(mean), Vec3::from_array(scale), Quat::from_array(q), 0.5);
             let footprint = FootprintGrad { mean: [d[0], d[1]], cov: [d[2], d[3], d[4]], depth: d[5] };
-            let found = project_pull(&g, 0, &View::new(&camera), &footprint);
+            let found = project_pull(&g, [0; WIDTH], &View::new(&camera), &[footprint; WIDTH])[2];
             let found: Vec<f64> = (found.mean.to_array().into_iter())
                 .chain(found.scale.to_array())
                 .chain(found.rotation.to_array())
@@ -328,7 +378,7 @@ mod tests {
             g.push(Vec3::from_array(mean), Vec3::ONE, Quat::IDENTITY, 0.5);
             g.factors.push(LowerFactor(l));
             let footprint = FootprintGrad { mean: [d[0], d[1]], cov: [d[2], d[3], d[4]], depth: d[5] };
-            let found = project_pull(&g, 0, &View::new(&camera), &footprint);
+            let found = project_pull(&g, [0; WIDTH], &View::new(&camera), &[footprint; WIDTH])[2];
             prop_assert_eq!((found.scale, found.rotation), (Vec3::ZERO, Vec4::ZERO));
             let found: Vec<f64> = found.mean.to_array().into_iter().chain(found.factor.0).map(f64::from).collect();
             for (range, what) in [(0..3, "mean"), (3..9, "factor")] {

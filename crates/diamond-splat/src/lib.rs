@@ -20,6 +20,7 @@ mod pullback;
 mod rasterize;
 pub mod relocation;
 mod visibility;
+mod wide;
 
 pub use config::{Cutoff, RasterConfig};
 pub use error::SplatError;

@@ -9,12 +9,12 @@
 //! its condition number has, and 1e-5 of relative error is what gradients are allowed. The determinant is a sum of
 //! squares (Cauchy–Binet), never a difference.
 use crate::bins::{Bins, Run, grid};
-use crate::footprint::{Linearised, View};
-use crate::lanes::Level;
+use crate::footprint::{Four, Linearised, View};
+use crate::wide::{WIDTH, Wide};
 use crate::{Cutoff, Gaussians, RasterConfig, SplatError};
 use diamond_camera::Camera;
+use diamond_simd::{Level, Simd, WithSimd};
 use glam::{Vec2, Vec3};
-use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -143,7 +143,7 @@ pub fn project(gaussians: &Gaussians, camera: &Camera, config: &RasterConfig) ->
         });
     }
     let view = View::new(camera);
-    let level = Level::native();
+    let level = Level::current();
     let runs: Vec<Run> = (0..n.div_ceil(CHUNK))
         .into_par_iter()
         .map(|chunk| {
@@ -178,8 +178,14 @@ impl WithSimd for ProjectRun<'_> {
         let ProjectRun { gaussians, range, view, config } = self;
         let mut splats = Vec::with_capacity(range.len());
         let mut outlines = Vec::with_capacity(range.len());
-        for i in range {
-            if let Some((splat, outline)) = project_one(gaussians, i, view, config) {
+        for first in range.clone().step_by(WIDTH) {
+            // The last stands in for those beyond the end; what comes out for them is not used.
+            let mut four = [first; WIDTH];
+            for k in 0..WIDTH {
+                four[k] = (first + k).min(range.end - 1);
+            }
+            let projected = project_four(gaussians, four, view, config);
+            for (splat, outline) in projected.into_iter().take(range.end - first).flatten() {
                 splats.push(splat);
                 outlines.push(outline);
             }
@@ -217,52 +223,66 @@ fn validate_camera(camera: &Camera) -> Result<(), SplatError> {
     Ok(())
 }
 
-/// One Gaussian's splat, `None` where it is culled. To be compiled where the instruction set is known: it has roots and
-/// roundings in it.
+/// Four Gaussians' splats, `None` where they are culled. To be compiled where the instruction set is known: it has roots
+/// and roundings in it.
 #[inline(always)]
-fn project_one(g: &Gaussians, i: usize, view: &View, config: &RasterConfig) -> Option<(Splat, Outline)> {
-    let opacity = g.opacities[i];
-    if opacity < config.min_alpha || opacity <= 0.0 {
-        return None;
-    }
-    let z = view.to_camera(g.means[i])[2];
-    if !(z > config.near as f64 && z < MAX_DEPTH) {
-        return None;
-    }
-    let lin = Linearised::of(g, i, view);
+fn project_four(g: &Gaussians, four: Four, view: &View, config: &RasterConfig) -> [Option<(Splat, Outline)>; WIDTH] {
+    let lin = Linearised::of(g, four, view);
     let [r0, r1] = lin.a;
-    let xx: f64 = r0.iter().map(|v| v * v).sum();
-    let yy: f64 = r1.iter().map(|v| v * v).sum();
-    let xy: f64 = (0..3).map(|j| r0[j] * r1[j]).sum();
+    let dot = |a: &[Wide; 3], b: &[Wide; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let (xx, yy, xy) = (dot(&r0, &r0), dot(&r1, &r1), dot(&r0, &r1));
     let minor = |j: usize, k: usize| r0[j] * r1[k] - r0[k] * r1[j];
+    let minors = [minor(0, 1), minor(0, 2), minor(1, 2)];
     let low = config.low_pass as f64;
-    let det = minor(0, 1).powi(2) + minor(0, 2).powi(2) + minor(1, 2).powi(2) + low * (xx + yy + low);
-    let cov = [xx + low, xy, yy + low];
-    let mean = [view.f[0] * lin.p[0] / z + view.c[0], view.f[1] * lin.p[1] / z + view.c[1]];
-    let chol = [(cov[2] / det).sqrt(), -cov[1] / (cov[2] * det).sqrt(), 1.0 / cov[2].sqrt()];
-    let log2_opacity = (opacity as f64).log2();
-    let tau = ((log2_opacity - (config.min_alpha as f64).log2()) * std::f64::consts::LN_2).max(0.0);
-    let two_tau = 2.0 * tau * (1.0 + EXTENT_SLACK) + EXTENT_SLACK;
+    let det = dot(&minors, &minors) + (xx + yy + Wide::of(low)) * low;
+    let cov = [xx + Wide::of(low), xy, yy + Wide::of(low)];
+    let mut mean = [Wide::ZERO; 2];
+    for axis in 0..2 {
+        mean[axis] = lin.p[axis] * view.f[axis] * lin.inv_z + Wide::of(view.c[axis]);
+    }
+    let inv_sqrt_yy = cov[2].sqrt().recip();
+    let inv_sqrt_det = det.sqrt().recip();
+    let chol = [cov[2].sqrt() * inv_sqrt_det, -cov[1] * inv_sqrt_yy * inv_sqrt_det, inv_sqrt_yy];
+    let min_alpha_log2 = (config.min_alpha as f64).log2();
+    let mut log2_opacity = Wide::ZERO;
+    for k in 0..WIDTH {
+        log2_opacity.0[k] = (g.opacities[four[k]] as f64).log2();
+    }
+    let tau = (log2_opacity - Wide::of(min_alpha_log2)).clamp(0.0, f64::MAX) * std::f64::consts::LN_2;
+    let two_tau = tau * (2.0 * (1.0 + EXTENT_SLACK)) + Wide::of(EXTENT_SLACK);
     let (ex, ey) = ((two_tau * cov[0]).sqrt(), (two_tau * cov[2]).sqrt());
-    let finite = within(&mean, MAX_MEAN) && within(&cov, MAX_COVARIANCE) && within(&chol, MAX_MEAN) && det.is_finite();
-    let (x0, x1) = pixel_range(mean[0], ex, view.size[0]);
-    let (y0, y1) = pixel_range(mean[1], ey, view.size[1]);
-    let splat = Splat {
-        mean,
-        chol,
-        gaussian: i as u32,
-        depth: z as f32,
-        opacity,
-        log2_opacity: log2_opacity as f32,
-        extent: [ex as f32, ey as f32],
-    };
-    let outline = Outline {
-        two_tau: two_tau as f32,
-        rightmost: (cov[1] / cov[0] * ex) as f32,
-        columns: [x0, x1],
-        rows: [y0, y1],
-    };
-    (finite && x0 < x1 && y0 < y1).then_some((splat, outline))
+    let rightmost = cov[1] * cov[0].recip() * ex;
+    let mut out = [None; WIDTH];
+    for k in 0..WIDTH {
+        let (opacity, z) = (g.opacities[four[k]], lin.p[2].0[k]);
+        let (mean, cov, chol) = (Wide::lane(&mean, k), Wide::lane(&cov, k), Wide::lane(&chol, k));
+        if opacity < config.min_alpha || opacity <= 0.0 || !(z > config.near as f64 && z < MAX_DEPTH) {
+            continue;
+        }
+        let finite = within(&mean, MAX_MEAN) && within(&cov, MAX_COVARIANCE) && within(&chol, MAX_MEAN);
+        let (x0, x1) = pixel_range(mean[0], ex.0[k], view.size[0]);
+        let (y0, y1) = pixel_range(mean[1], ey.0[k], view.size[1]);
+        if !(finite && det.0[k].is_finite() && x0 < x1 && y0 < y1) {
+            continue;
+        }
+        let splat = Splat {
+            mean,
+            chol,
+            gaussian: four[k] as u32,
+            depth: z as f32,
+            opacity,
+            log2_opacity: log2_opacity.0[k] as f32,
+            extent: [ex.0[k] as f32, ey.0[k] as f32],
+        };
+        let outline = Outline {
+            two_tau: two_tau.0[k] as f32,
+            rightmost: rightmost.0[k] as f32,
+            columns: [x0, x1],
+            rows: [y0, y1],
+        };
+        out[k] = Some((splat, outline));
+    }
+    out
 }
 
 /// Screen means beyond this (px) and covariances beyond this (px²) are culled: their f32 copies would overflow when

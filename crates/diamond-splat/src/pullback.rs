@@ -12,9 +12,9 @@ use crate::RasterGrad;
 use crate::bins::{Reached, Scratch};
 use crate::blend::{Scene, TOGETHER};
 use crate::ellipse::{BLOCK, LANES, Prepared};
-use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite, load, store, with_lanes};
+use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite};
+use diamond_simd::{Simd, WithSimd, load_block, store_block, with_lanes};
 use glam::{Mat4, Vec4};
-use pulp::{Simd, WithSimd};
 
 /// Splats that go through the matrix products together.
 const GROUP: usize = 4;
@@ -146,7 +146,7 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
             }
         }
         // Front to back: the weights again.
-        let mut t = load::<S, N>(&place.initial_transmittance());
+        let mut t = load_block::<S, N>(&place.initial_transmittance());
         let n = reach;
         prepared.resize(n.next_multiple_of(TOGETHER), Prepared::NOTHING);
         if pairs.len() < prepared.len() {
@@ -165,13 +165,13 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
                     a[i] = s.select_f32s(counts, a[i], zero);
                     t_before[i] = s.select_f32s(counts, before[i], zero);
                 }
-                store::<S, N>(&mut pairs[m].alpha, a);
-                store::<S, N>(&mut pairs[m].transmittance, t_before);
-                store::<S, N>(&mut pairs[m].chain, chains[m]);
+                store_block::<S, N>(&mut pairs[m].alpha, a);
+                store_block::<S, N>(&mut pairs[m].transmittance, t_before);
+                store_block::<S, N>(&mut pairs[m].chain, chains[m]);
             }
         }
         // Back to front.
-        let d_one = load::<S, N>(&d_one);
+        let d_one = load_block::<S, N>(&d_one);
         let mut behind = [zero; N];
         let mut end = n;
         while end > 0 {
@@ -188,7 +188,7 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
             }
             let mut e = [d_one; GROUP];
             for c in 0..=channels {
-                let d = load::<S, N>(&by_channel[c]);
+                let d = load_block::<S, N>(&by_channel[c]);
                 for m in 0..GROUP {
                     let f = s.splat_f32s(scratch.features[rows[m] + c]);
                     for i in 0..N {
@@ -200,9 +200,9 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
             let mut g = [[0.0f32; LANES]; GROUP];
             for m in (0..end - begin).rev() {
                 let pair = &pairs[begin + m];
-                let a = load::<S, N>(&pair.alpha);
-                let t = load::<S, N>(&pair.transmittance);
-                let chain = load::<S, N>(&pair.chain);
+                let a = load_block::<S, N>(&pair.alpha);
+                let t = load_block::<S, N>(&pair.transmittance);
+                let chain = load_block::<S, N>(&pair.chain);
                 let mut w_m = a;
                 let mut g_m = a;
                 for i in 0..N {
@@ -211,8 +211,8 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
                     g_m[i] = s.mul_f32s(s.mul_f32s(t[i], gain), chain[i]);
                     behind[i] = s.mul_add_e_f32s(a[i], gain, behind[i]);
                 }
-                store::<S, N>(&mut w[m], w_m);
-                store::<S, N>(&mut g[m], g_m);
+                store_block::<S, N>(&mut w[m], w_m);
+                store_block::<S, N>(&mut g[m], g_m);
             }
             // Σ over pixels of g·basis and w·dC, a vector of columns at a time.
             let mut about_centre = [[0.0f32; MOMENTS]; GROUP];

@@ -3,12 +3,14 @@ use crate::bins::{REGION, Reached, Scratch};
 use crate::blend::{RegionForward, RegionImage, Scene};
 use crate::ellipse::KAPPA2;
 use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
-use crate::lanes::{Level, Thresholds};
+use crate::lanes::Thresholds;
 use crate::projection::{CHUNK, is_smooth, project};
 use crate::pullback::{GEOMETRY, RegionBackward};
+use crate::wide::WIDTH;
 use crate::{Features, Gaussians, GaussiansGrad, LowerFactor, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
 use diamond_image::Image;
+use diamond_simd::Level;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -109,7 +111,7 @@ pub fn rasterize<'a>(
     config: &RasterConfig,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let projection = project(gaussians, camera, config)?;
-    blend(Cow::Owned(projection), gaussians, features, Level::native())
+    blend(Cow::Owned(projection), gaussians, features, Level::current())
 }
 
 /// [`rasterize`] with a projection that was made before, for callers that compute features of
@@ -123,7 +125,7 @@ pub fn rasterize_projected<'a>(
     gaussians: &'a Gaussians,
     features: &'a Features,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
-    blend(Cow::Borrowed(projection), gaussians, features, Level::native())
+    blend(Cow::Borrowed(projection), gaussians, features, Level::current())
 }
 
 fn blend<'a>(
@@ -317,11 +319,11 @@ struct GatherRun<'a> {
     to: RunGrad<'a>,
 }
 
-impl pulp::WithSimd for GatherRun<'_> {
+impl diamond_simd::WithSimd for GatherRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
+    fn with_simd<S: diamond_simd::Simd>(self, _: S) {
         let GatherRun { pullback, parts, view, line, run, to } = self;
         let bins = &pullback.projection.bins;
         let channels = pullback.features.channels;
@@ -331,19 +333,28 @@ impl pulp::WithSimd for GatherRun<'_> {
             let from = &parts[region][slot * line..][..line];
             sums[splat * line..][..line].iter_mut().zip(from).for_each(|(a, b)| *a += b);
         });
-        for (splat, sums) in splats.iter().zip(sums.chunks_exact(line)) {
-            let gaussian = splat.gaussian as usize;
-            let i = gaussian - run * CHUNK;
-            let (moments, features) = sums.split_at(GEOMETRY);
-            let footprint = footprint_grad(moments, splat.chol, features[channels] as f64);
-            let d = project_pull(pullback.gaussians, gaussian, view, &footprint);
-            (to.means[i], to.scales[i], to.rotations[i]) = (d.mean, d.scale, d.rotation);
-            if let Some(factor) = to.factors.get_mut(i) {
-                *factor = d.factor;
+        for (first, splats) in (0..splats.len()).step_by(WIDTH).zip(splats.chunks(WIDTH)) {
+            // The last stands in for those beyond the end.
+            let mut four = [0; WIDTH];
+            let mut footprints = [FootprintGrad::default(); WIDTH];
+            for k in 0..WIDTH {
+                let last = k.min(splats.len() - 1);
+                let (moments, features) = sums[(first + last) * line..][..line].split_at(GEOMETRY);
+                four[k] = splats[last].gaussian as usize;
+                footprints[k] = footprint_grad(moments, splats[last].chol, features[channels] as f64);
             }
-            to.opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
-            to.screen[i] = Vec2::from_array(footprint.mean.map(finite_f32));
-            to.features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);
+            let pulled = project_pull(pullback.gaussians, four, view, &footprints);
+            for (k, splat) in splats.iter().enumerate() {
+                let (i, d) = (four[k] - run * CHUNK, &pulled[k]);
+                let (moments, features) = sums[(first + k) * line..][..line].split_at(GEOMETRY);
+                (to.means[i], to.scales[i], to.rotations[i]) = (d.mean, d.scale, d.rotation);
+                if let Some(factor) = to.factors.get_mut(i) {
+                    *factor = d.factor;
+                }
+                to.opacities[i] = finite_f32(moments[0] as f64 / splat.opacity as f64);
+                to.screen[i] = Vec2::from_array(footprints[k].mean.map(finite_f32));
+                to.features[i * channels..(i + 1) * channels].copy_from_slice(&features[..channels]);
+            }
         }
     }
 }
@@ -413,8 +424,8 @@ mod tests {
             assert!(error.sqrt() <= 2e-6 * norm.sqrt(), "{what}: {:.2e}", error.sqrt() / norm.sqrt());
         };
         let flat = |v: &[Vec3]| v.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
-        let (b, pull_b) = run(Level::native());
-        for level in [Level::Scalar, Level::Four, Level::Sixteen] {
+        let (b, pull_b) = run(Level::current());
+        for level in Level::testable() {
             let (a, pull_a) = run(level);
             close(a.features.data(), b.features.data(), "features");
             close(a.depth.data(), b.depth.data(), "depth");
@@ -422,6 +433,9 @@ mod tests {
             close(&pull_a.gaussians.opacities, &pull_b.gaussians.opacities, "d opacities");
             close(&flat(&pull_a.gaussians.means), &flat(&pull_b.gaussians.means), "d means");
             close(&flat(&pull_a.gaussians.scales), &flat(&pull_b.gaussians.scales), "d scales");
+            if level.is_fused() == Level::current().is_fused() {
+                assert_eq!((a, pull_a), (b.clone(), pull_b.clone()), "same bits at {} lanes", level.width());
+            }
         }
     }
 }

@@ -218,15 +218,15 @@ impl GaussianBvh {
 
     fn transmittance_without(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> f32 {
         struct Trace<'a>(&'a GaussianBvh, u32, Vec3, Vec3, f32, f32);
-        impl pulp::WithSimd for Trace<'_> {
+        impl diamond_simd::WithSimd for Trace<'_> {
             type Output = f32;
             #[inline(always)]
-            fn with_simd<S: pulp::Simd>(self, _: S) -> f32 {
+            fn with_simd<S: diamond_simd::Simd>(self, _: S) -> f32 {
                 let Trace(bvh, skip, origin, direction, t_min, t_max) = self;
                 bvh.trace(skip, origin, direction, t_min, t_max)
             }
         }
-        pulp::Arch::new().dispatch(Trace(self, skip, origin, direction, t_min, t_max))
+        diamond_simd::Level::current().dispatch(Trace(self, skip, origin, direction, t_min, t_max))
     }
 
     /// Written for scalars; the compiler makes vectors of whatever width the caller's instruction set has. Without

@@ -131,7 +131,11 @@ fn eight(arguments: &Arguments) -> Result<(), String> {
         let (raster, _) =
             rasterize(&scene.gaussians, &scene.features, &scene.camera, &counted).map_err(|e| e.to_string())?;
         let blended = raster.stats.blended_pairs.unwrap_or(0) as f64;
-        let errors = if arguments.forward_only || std::env::var("NOERR").is_ok() { None } else { Some(error::against_f64(&scene)?) };
+        let errors = if arguments.forward_only || std::env::var("NOERR").is_ok() {
+            None
+        } else {
+            Some(error::against_f64(&scene)?)
+        };
         let best = |seconds: &[f64]| seconds.iter().copied().fold(f64::MAX, f64::min);
         let number = |v: f64| format!("{v:.2}");
         let share = 100.0 * blended / best(&forward) / roof;

@@ -52,7 +52,7 @@ pub const PACKAGES: &[Package] = &[
     light("diamond-light", 0, &["glam"]),
     heavy("diamond-simd", 0, &["pulp"]),
     heavy(TESTKIT, 0, &["proptest"]),
-    heavy("diamond-splat", 1, &["glam", "rayon", "pulp"]),
+    heavy("diamond-splat", 1, &["glam", "rayon"]),
     Package {
         name: "diamond-shading",
         floor: 1,
