@@ -20,6 +20,7 @@
 //! ```
 mod camera;
 mod depth;
+mod distortion;
 mod error;
 mod intrinsics;
 mod plucker;
@@ -29,6 +30,7 @@ mod trajectory;
 
 pub use camera::{Camera, Ray};
 pub use depth::Depth;
+pub use distortion::Distortion;
 pub use error::CameraError;
 pub use intrinsics::Intrinsics;
 pub use plucker::plucker_map;

@@ -1,16 +1,20 @@
 //! A capture: views, the shots of each view, and where everything lies.
 use crate::cache::ImageCache;
-use crate::exclusions::{Exclusions, strip_png};
-use crate::frames::{Frame, Frames, Lens};
+use crate::develop::Undistortion;
+use crate::exclusions::{Exclusions, strip_extension};
+use crate::format::{CaptureFormat, Found, Source};
+use crate::frames::{Frame, Frames};
+use crate::lights::{Lights, parse_lights};
+use crate::views::Context;
 use crate::{DatasetError, Place, folder};
-use diamond_camera::{Camera, Intrinsics};
+use diamond_camera::Camera;
 use diamond_image::Transfer;
 use diamond_light::OlatLight;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
-/// How the stored values of the PNGs relate to linear radiance (`Srgb` unless the user knows better; the real captures
+/// How the stored values of PNG and JPEG files relate to linear radiance (`Srgb` unless the user knows better; the real captures
 /// of the SSS-3DGS data set are `Gamma22`). Chunks in the PNG that speak of colour are ignored.
 pub type TransferChoice = Transfer;
 
@@ -32,24 +36,32 @@ pub enum AlphaPremultiplied {
 /// Which file holds the held-out images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum EvalSplit {
-    /// `transforms_test.json`, or `transforms_eval.json` where only that exists.
+    /// `transforms_test.json`, else `transforms_eval.json`, else `transforms_val.json`.
     #[default]
     Test,
-    /// `transforms_eval.json`, or `transforms_test.json` where only that exists.
+    /// `transforms_eval.json`, else `transforms_val.json`, else `transforms_test.json`.
     Eval,
 }
 
 /// How to open a capture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OpenOptions {
-    /// Stored values → linear radiance.
+    /// The format, or `None` to take what the folder holds: `transforms_train.json` before `transforms.json` before a
+    /// COLMAP model.
+    pub format: Option<CaptureFormat>,
+    /// Stored values of PNG and JPEG files → linear radiance.
     pub transfer: TransferChoice,
+    /// Stored values of EXR files → linear radiance; linear, unless a program wrote something else.
+    pub exr_transfer: Transfer,
     /// Whether RGB is already multiplied by alpha.
     pub alpha_premultiplied: AlphaPremultiplied,
     /// Bound of the image cache, bytes of stored samples (4 per pixel of an 8-bit RGBA image). Default 512 MiB.
     pub cache_bytes: usize,
     /// Which file holds the held-out images.
     pub eval_split: EvalSplit,
+    /// Of a nerfstudio or COLMAP capture that holds nothing out itself, every view with an index of `n − 1` modulo `n` is
+    /// held out; 0 keeps all for training. Default 8.
+    pub hold_out_every: usize,
     /// Images whose header promises more pixels are refused before they are decoded. Default 64 Mi pixels.
     pub max_pixels: u64,
 }
@@ -57,10 +69,13 @@ pub struct OpenOptions {
 impl Default for OpenOptions {
     fn default() -> Self {
         Self {
+            format: None,
             transfer: Transfer::Srgb,
+            exr_transfer: Transfer::Linear,
             alpha_premultiplied: AlphaPremultiplied::Auto,
             cache_bytes: 512 << 20,
             eval_split: EvalSplit::Test,
+            hold_out_every: 8,
             max_pixels: 64 << 20,
         }
     }
@@ -88,6 +103,22 @@ pub enum Provenance {
     },
 }
 
+/// What says which pixels of an image show the object.
+///
+/// In this order: the file that the capture names (`mask_path`), a mask file beside the image, the image's alpha, a
+/// photograph of the background. Where a mask file is there, the image's own alpha is not looked at; a background is only
+/// where there is no alpha.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum MaskSource {
+    /// The image's alpha; without one nothing says it.
+    #[default]
+    Alpha,
+    /// A mask file: white (and opaque) on the object.
+    File(PathBuf),
+    /// The alpha where there is one, else the difference from this photograph of the background.
+    Background(PathBuf),
+}
+
 /// One image: a view under one light.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
@@ -107,6 +138,10 @@ pub struct Shot {
     pub width: u32,
     /// Height of the image, pixels.
     pub height: u32,
+    /// What says which pixels show the object.
+    pub mask: MaskSource,
+    /// The lens to take out on loading; `None` for a pinhole.
+    pub undistortion: Option<Arc<Undistortion>>,
     /// The field that names the image, for error messages.
     pub named_by: Place,
 }
@@ -137,8 +172,11 @@ pub struct Capture {
     pub train: Vec<View>,
     /// Held-out views; may be empty.
     pub test: Vec<View>,
-    /// `points3d.ply` where it exists.
+    /// The file of the initial points, where there is one: `points3d.ply`, the `ply_file_path` of nerfstudio, or COLMAP's
+    /// `points3D.bin` or `.txt` (see [`crate::read_colmap_points`]).
     pub points: Option<PathBuf>,
+    /// How the capture is written down.
+    pub format: CaptureFormat,
     /// Remarks for the user: what was ignored or is missing, one sentence each.
     pub notes: Vec<String>,
     /// The options it was opened with.
@@ -160,14 +198,16 @@ pub(crate) struct Shared {
     pub(crate) hash: OnceLock<String>,
 }
 
-const TRAIN_JSON: &str = "transforms_train.json";
-
 impl Capture {
-    /// Opens a capture: reads and checks its JSON files, and that every image exists; decodes none.
+    /// Opens a capture: reads and checks the files that describe it, and that every image exists; decodes none.
     ///
-    /// `path` is the capture's folder, or one of its JSON files. A folder must hold `transforms_train.json` (or, for
-    /// captures without held-out images, `transforms.json`); `transforms_test.json` or `transforms_eval.json` is
-    /// optional. Any other JSON file is read as the training split alone, with its folder as the capture's.
+    /// `path` is the capture's folder, or one of its files. What the folder holds decides how it is read (unless
+    /// [`OpenOptions::format`] does): `transforms_train.json` with `transforms_test.json`, `_eval` or `_val` for held-out
+    /// images; else `transforms.json`; else a COLMAP model. Any other JSON file is read as the training split alone, with
+    /// its folder as the capture's. What was read and why is the first of [`Capture::notes`] where it is not
+    /// `transforms_train.json` alone.
+    ///
+    /// `lights.json` in the folder gives lights to images whose format has none (see docs/formats.md).
     /// `exclude_list.txt` in the folder names images to leave out, one per line: a path or a bare name, with or without
     /// extension; `#` begins a comment.
     ///
@@ -175,37 +215,47 @@ impl Capture {
     /// splits is noted, since it makes the evaluation meaningless.
     pub fn open(path: &Path, options: &OpenOptions) -> Result<Capture, DatasetError> {
         let canonical = path.canonicalize().map_err(|e| DatasetError::io(path, "open the capture", e))?;
-        let (root, train_json, only_train) = find_train(&canonical)?;
+        let found = crate::format::find(&canonical, options.format, options.eval_split)?;
+        let root = &found.root;
+        let mut documents = Vec::new();
         let mut notes = Vec::new();
-        let mut documents = vec![train_json.clone()];
-        let excluded = Exclusions::read(&root, &mut documents)?;
-        let train = build_split(&root, &train_json, Split::Train, &excluded, options, &mut notes)?;
-        let mut test = Vec::new();
-        if !only_train {
-            let order = match options.eval_split {
-                EvalSplit::Test => ["transforms_test.json", "transforms_eval.json"],
-                EvalSplit::Eval => ["transforms_eval.json", "transforms_test.json"],
-            };
-            if let Some(name) = order.iter().find(|name| root.join(name).is_file()) {
-                documents.push(root.join(name));
-                test = build_split(&root, &root.join(name), Split::Test, &excluded, options, &mut notes)?;
-            }
+        if found.format != CaptureFormat::Blender || found.why.contains("goes before") {
+            notes.push(found.why.clone());
         }
+        let (file, train_frames, test_frames) = read_source(&found, &mut documents)?;
+        let excluded = Exclusions::read(root, &mut documents)?;
+        if let Source::Transforms { test, .. } = &found.source {
+            documents.extend(test.clone());
+        }
+        let lights = read_lights(root, &mut documents)?;
+        let image_folders: &[&str] = match found.format {
+            CaptureFormat::Colmap => &["images", "image", "input", "."],
+            CaptureFormat::Blender | CaptureFormat::Nerfstudio => &["."],
+        };
+        let lights = lights.as_ref();
+        let context = Context { root, file: &file, image_folders, excluded: &excluded, lights, options };
+        let (mut train, mut test) = split(&context, &found, &train_frames, test_frames.as_ref(), &mut notes)?;
+        context.find_geometry(&mut train);
+        context.find_geometry(&mut test);
         if test.is_empty() {
             notes.push("no held-out images: the result cannot be evaluated on views or lights it has not seen".into());
         }
         if train.is_empty() {
             return Err(DatasetError::Field {
-                place: Place { file: train_json, frame: None, field: Some("frames".into()) }.into(),
+                place: Place { file, frame: None, field: Some("frames".into()) }.into(),
                 expected: "at least one image".into(),
                 found: "none (no frames, no images in them, or all of them excluded)".into(),
                 advice: "add a frame with file_paths and light_positions",
             });
         }
         excluded.note_unused(&mut notes);
-        let points = Some(root.join("points3d.ply")).filter(|p| p.is_file());
-        documents.extend(points.clone());
+        lights.iter().for_each(|lights| lights.note_unused(&mut notes));
+        note_lenses_and_masks(&train, &test, &mut notes);
+        let points = find_points(&found, &train_frames, &mut notes)?;
+        documents.extend(points.clone().filter(|p| !documents.contains(p)));
         let images = all_images(&train, &test, &mut notes);
+        let beside: BTreeSet<PathBuf> = train.iter().chain(&test).flat_map(|v| &v.shots).filter_map(mask_file).collect();
+        documents.extend(beside);
         Ok(Capture {
             shared: Arc::new(Shared {
                 cache: ImageCache::new(options.cache_bytes),
@@ -215,10 +265,11 @@ impl Capture {
                 premultiplied: OnceLock::new(),
                 hash: OnceLock::new(),
             }),
-            root,
+            root: found.root,
             train,
             test,
             points,
+            format: found.format,
             notes,
             options: options.clone(),
         })
@@ -233,165 +284,142 @@ impl Capture {
     }
 }
 
-/// The folder, its training file, and whether there is only that file.
-fn find_train(path: &Path) -> Result<(PathBuf, PathBuf, bool), DatasetError> {
-    if path.is_dir() {
-        let candidates = [TRAIN_JSON, "transforms.json"];
-        return match candidates.iter().map(|name| path.join(name)).find(|p| p.is_file()) {
-            Some(json) => Ok((path.to_path_buf(), json, false)),
-            None => Err(DatasetError::io(
-                &path.join(TRAIN_JSON),
-                "open the training frames",
-                std::io::Error::other("no such file in this folder; is this the capture's folder?"),
-            )),
-        };
-    }
-    let root = path.parent().unwrap_or(path).to_path_buf();
-    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-    match name {
-        TRAIN_JSON => Ok((root, path.to_path_buf(), false)),
-        "transforms_test.json" | "transforms_eval.json" => find_train(&root),
-        _ => Ok((root, path.to_path_buf(), true)),
+/// The file that describes the training images, its frames, and those of the held-out images where a file has them.
+fn read_source(
+    found: &Found,
+    documents: &mut Vec<PathBuf>,
+) -> Result<(PathBuf, Frames, Option<Frames>), DatasetError> {
+    match &found.source {
+        Source::Transforms { train, test } => {
+            documents.push(train.clone());
+            let frames = crate::frames::read_frames(train)?;
+            let held_out = test.as_ref().map(|path| crate::frames::read_frames(path)).transpose()?;
+            Ok((train.clone(), frames, held_out))
+        }
+        Source::Colmap(model) => {
+            documents.extend([model.cameras.clone(), model.images.clone()]);
+            Ok((model.images.clone(), model.read()?, None))
+        }
     }
 }
 
-fn build_split(
-    root: &Path,
-    json: &Path,
-    split: Split,
-    excluded: &Exclusions,
-    options: &OpenOptions,
+/// The largest `lights.json` that is read, bytes.
+const MAX_LIGHTS_BYTES: u64 = 64 << 20;
+
+fn read_lights(root: &Path, documents: &mut Vec<PathBuf>) -> Result<Option<Lights>, DatasetError> {
+    let path = root.join("lights.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let bytes = folder::read_bytes(&path, MAX_LIGHTS_BYTES, "read the lights")?;
+    let lights = parse_lights(&path, &bytes)?;
+    documents.push(path);
+    Ok(Some(lights))
+}
+
+/// Training and held-out views: as files or lists of the capture say, else every so many views.
+fn split(
+    context: &Context,
+    found: &Found,
+    frames: &Frames,
+    held_out: Option<&Frames>,
     notes: &mut Vec<String>,
-) -> Result<Vec<View>, DatasetError> {
-    let Frames { frames, notes: remarks } = crate::frames::read_frames(json)?;
-    notes.extend(remarks);
-    let mut views: Vec<View> = Vec::new();
-    let mut first_use: BTreeMap<PathBuf, Place> = BTreeMap::new();
-    for frame in frames {
-        let mut shots = Vec::new();
-        for (light_index, entry) in frame.entries.iter().enumerate() {
-            if excluded.contains(&entry.file) {
-                continue;
+) -> Result<(Vec<View>, Vec<View>), DatasetError> {
+    notes.extend(frames.notes.iter().cloned());
+    notes.extend(held_out.iter().flat_map(|f| &f.notes).cloned());
+    if let Some(held_out) = held_out {
+        let train = context.build(frames, Split::Train, &|_| true)?;
+        return Ok((train, context.build(held_out, Split::Test, &|_| true)?));
+    }
+    if let Some(test_files) = frames.test_files.as_ref().filter(|_| found.may_hold_out) {
+        let named = |list: &[String], frame: &Frame| {
+            let is = |a: &str, b: &str| strip_extension(a.trim_start_matches("./")) == strip_extension(b.trim_start_matches("./"));
+            frame.entries.iter().any(|e| list.iter().any(|f| is(f, &e.file)))
+        };
+        let is_test = |frame: &Frame| named(test_files, frame);
+        let is_train = |frame: &Frame| match &frames.train_files {
+            Some(list) => named(list, frame),
+            None => !is_test(frame),
+        };
+        let test = context.build(frames, Split::Test, &is_test)?;
+        notes.push(format!("held-out images are those that the file itself lists: {} views", test.len()));
+        return Ok((context.build(frames, Split::Train, &is_train)?, test));
+    }
+    let all = context.build(frames, Split::Train, &|_| true)?;
+    let every = context.options.hold_out_every;
+    if !found.may_hold_out || every < 2 || all.len() < every {
+        return Ok((all, vec![]));
+    }
+    let (mut train, mut test) = (Vec::new(), Vec::new());
+    for (i, mut view) in all.into_iter().enumerate() {
+        if i % every == every - 1 {
+            view.split = Split::Test;
+            test.push(view);
+        } else {
+            train.push(view);
+        }
+    }
+    notes.push(format!(
+        "the capture holds no images out, so each {every}th view is ({} of {}): see OpenOptions::hold_out_every",
+        test.len(),
+        test.len() + train.len()
+    ));
+    Ok((train, test))
+}
+
+/// The file of the initial points.
+fn find_points(found: &Found, frames: &Frames, notes: &mut Vec<String>) -> Result<Option<PathBuf>, DatasetError> {
+    let ply = found.root.join("points3d.ply");
+    if ply.is_file() {
+        return Ok(Some(ply));
+    }
+    match &found.source {
+        Source::Colmap(model) => Ok(model.points.clone()),
+        Source::Transforms { train, .. } => {
+            let Some(named) = &frames.points else { return Ok(None) };
+            let place = Place { file: train.clone(), frame: None, field: Some("ply_file_path".into()) };
+            match folder::resolve(&found.root, named, &place) {
+                Ok(path) => Ok(Some(path)),
+                Err(e @ DatasetError::Outside { .. }) => Err(e),
+                Err(_) => {
+                    notes.push(format!("ply_file_path names \"{named}\", which is not there: no initial points"));
+                    Ok(None)
+                }
             }
-            let path = find_image(root, &entry.file, &entry.place)?;
-            if let Some(first) = first_use.insert(path.clone(), entry.place.clone()) {
-                return Err(DatasetError::Field {
-                    place: entry.place.clone().into(),
-                    expected: "an image that no other entry of the file names".into(),
-                    found: format!("\"{}\", already named by {first}", entry.file),
-                    advice: "an image has one camera and one light: remove one of the two entries",
-                });
-            }
-            shots.push(Shot {
-                name: path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
-                path,
-                light: entry.light,
-                provenance: entry.provenance.clone(),
-                weight: entry.weight,
-                light_index,
-                width: 0,
-                height: 0,
-                named_by: entry.place.clone(),
-            });
-        }
-        if shots.is_empty() {
-            continue;
-        }
-        let camera = Camera { intrinsics: intrinsics(&frame, &shots[0], json, options)?, pose: frame.pose };
-        for shot in &mut shots {
-            (shot.width, shot.height) = (camera.intrinsics.width, camera.intrinsics.height);
-        }
-        // In the NeRF layout each image is a frame of its own: frames with the same camera are one view.
-        if frame.entries.len() == 1
-            && let Some(view) = views.iter_mut().find(|view| view.camera == camera)
-        {
-            shots.iter_mut().for_each(|shot| shot.light_index = view.shots.len());
-            view.shots.append(&mut shots);
-            continue;
-        }
-        let name = view_name(&shots).unwrap_or_else(|| format!("view_{}", frame.index));
-        views.push(View { name, camera, shots, split, index: frame.index, geometry: None });
-    }
-    let folder = match split {
-        Split::Train => "train",
-        Split::Test => "test",
-    };
-    for view in &mut views {
-        let path = format!("geometry/{folder}_{}.exr", view.name);
-        view.geometry = folder::resolve(root, &path, &Place::file(json)).ok();
-    }
-    make_names_unique(root, &mut views);
-    Ok(views)
-}
-
-/// The image that an entry names: `.png` is appended; an extension that is already there is tolerated.
-fn find_image(root: &Path, written: &str, place: &Place) -> Result<PathBuf, DatasetError> {
-    let with_png =
-        if strip_png(written).len() < written.len() { written.to_string() } else { format!("{written}.png") };
-    folder::resolve(root, &with_png, place)
-}
-
-/// Intrinsics of a frame; a missing image size is read from the header of its first image.
-fn intrinsics(frame: &Frame, first: &Shot, json: &Path, options: &OpenOptions) -> Result<Intrinsics, DatasetError> {
-    let (width, height) = match (frame.width, frame.height) {
-        (Some(w), Some(h)) => (w, h),
-        _ => crate::stored::read_size(&first.path, &first.named_by)?,
-    };
-    if u64::from(width) * u64::from(height) > options.max_pixels {
-        let max_pixels = options.max_pixels;
-        let named_by =
-            Place { file: json.to_path_buf(), frame: Some(frame.index), field: Some("width, height".into()) };
-        return Err(DatasetError::TooLarge {
-            path: first.path.clone(),
-            named_by: named_by.into(),
-            width,
-            height,
-            max_pixels,
-        });
-    }
-    let (centre_x, centre_y) = (0.5 * width as f32, 0.5 * height as f32);
-    Ok(match frame.lens {
-        Lens::FovX { fov_x, cx, cy } => {
-            let k = Intrinsics::from_fov_x(fov_x, width, height);
-            Intrinsics { cx: cx.unwrap_or(k.cx), cy: cy.unwrap_or(k.cy), ..k }
-        }
-        Lens::Focal { fx, fy, cx, cy } => {
-            Intrinsics { fx, fy, cx: cx.unwrap_or(centre_x), cy: cy.unwrap_or(centre_y), width, height }
-        }
-    })
-}
-
-/// `r_<view>` where all shots are called `r_<view>_l_<light>` with the same view.
-fn view_name(shots: &[Shot]) -> Option<String> {
-    let mut names = shots.iter().map(|shot| {
-        let (view, light) = shot.name.strip_prefix("r_")?.split_once("_l_")?;
-        (is_number(view) && is_number(light)).then(|| format!("r_{view}"))
-    });
-    let first = names.next()??;
-    names.all(|name| name.as_deref() == Some(&first)).then_some(first)
-}
-
-fn is_number(text: &str) -> bool {
-    !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit())
-}
-
-/// Views and shots whose names collide get the frame's index, or the folder, into their names.
-fn make_names_unique(root: &Path, views: &mut [View]) {
-    let mut seen = BTreeSet::new();
-    for view in views.iter_mut() {
-        if !seen.insert(view.name.clone()) {
-            view.name = format!("{}_frame_{}", view.name, view.index);
         }
     }
-    let mut count: BTreeMap<String, usize> = BTreeMap::new();
-    for shot in views.iter().flat_map(|view| &view.shots) {
-        *count.entry(shot.name.clone()).or_default() += 1;
+}
+
+/// The file that a shot's mask comes from, if it is not the image.
+fn mask_file(shot: &Shot) -> Option<PathBuf> {
+    match &shot.mask {
+        MaskSource::Alpha => None,
+        MaskSource::File(path) | MaskSource::Background(path) => Some(path.clone()),
     }
-    for shot in views.iter_mut().flat_map(|view| &mut view.shots) {
-        if count[&shot.name] > 1 {
-            let relative = shot.path.strip_prefix(root).unwrap_or(&shot.path).with_extension("");
-            shot.name = relative.components().map(|c| c.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("_");
-        }
+}
+
+/// Says what is undistorted and where masks come from, unless all of it is alpha.
+fn note_lenses_and_masks(train: &[View], test: &[View], notes: &mut Vec<String>) {
+    let shots = || train.iter().chain(test).flat_map(|v| &v.shots);
+    let count = |f: &dyn Fn(&Shot) -> bool| shots().filter(|s| f(s)).count();
+    let all = count(&|_| true);
+    let bent = count(&|s| s.undistortion.is_some());
+    if bent > 0 {
+        notes.push(format!(
+            "{bent} of {all} images are undistorted on loading: same size, focal lengths and principal point, so what \
+             the lens saw beyond that pinhole's field of view is cut off"
+        ));
+    }
+    let files = count(&|s| matches!(s.mask, MaskSource::File(_)));
+    if files > 0 {
+        notes.push(format!("masks: of {files} of {all} images from files (an alpha of theirs is not looked at)"));
+    }
+    let backgrounds = count(&|s| matches!(s.mask, MaskSource::Background(_)));
+    if backgrounds > 0 {
+        notes.push(format!(
+            "masks: of {backgrounds} of {all} images from the alpha or, where there is none, by comparison with a \
+             photograph of the background; look at them before you rely on them"
+        ));
     }
 }
 

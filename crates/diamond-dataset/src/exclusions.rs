@@ -12,20 +12,25 @@ pub(crate) struct Exclusions {
 /// The largest exclude list that is read, bytes.
 const MAX_EXCLUDE_BYTES: u64 = 64 << 20;
 
-/// A path with `/` between its parts and without a leading `./` and a trailing `.png`.
+/// A path with `/` between its parts and without a leading `./` and a trailing extension of an image.
 fn plain_name(path: &str) -> String {
     let unified = path.trim().replace('\\', "/");
     let bare = unified.trim_start_matches("./");
-    strip_png(bare).to_string()
+    strip_extension(bare).to_string()
 }
 
-/// A name without a trailing `.png`, in whatever case.
-pub(crate) fn strip_png(name: &str) -> &str {
-    let cut = name.len().saturating_sub(4);
-    match name.is_char_boundary(cut) && name[cut..].eq_ignore_ascii_case(".png") {
-        true => &name[..cut],
-        false => name,
+/// Extensions of the images that can be read.
+pub(crate) const EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"];
+
+/// A name without a trailing extension of an image, in whatever case.
+pub(crate) fn strip_extension(name: &str) -> &str {
+    for extension in EXTENSIONS {
+        let cut = name.len().saturating_sub(extension.len());
+        if name.is_char_boundary(cut) && name[cut..].eq_ignore_ascii_case(extension) {
+            return &name[..cut];
+        }
     }
+    name
 }
 
 impl Exclusions {

@@ -26,6 +26,16 @@ fn describe(value: &Value) -> String {
     }
 }
 
+/// The JSON value of a text, or where its first mistake is.
+pub(crate) fn parse_json(path: &std::path::Path, text: &str) -> Result<Value, DatasetError> {
+    serde_json::from_str(text).map_err(|e| DatasetError::Json {
+        path: path.to_path_buf(),
+        line: e.line(),
+        column: e.column(),
+        reason: e.to_string(),
+    })
+}
+
 impl<'a> Object<'a> {
     /// The object `value`; an error where it is none.
     pub(crate) fn new(

@@ -49,8 +49,8 @@ fn lexical(relative: &str) -> Option<PathBuf> {
     if parts.is_empty() { None } else { Some(parts.iter().collect()) }
 }
 
-/// Reads a text file of at most `limit` bytes.
-pub(crate) fn read_text(path: &Path, limit: u64, action: &'static str) -> Result<String, DatasetError> {
+/// Reads a file of at most `limit` bytes.
+pub(crate) fn read_bytes(path: &Path, limit: u64, action: &'static str) -> Result<Vec<u8>, DatasetError> {
     use std::io::Read;
     let file = std::fs::File::open(path).map_err(|e| DatasetError::io(path, action, e))?;
     let mut bytes = Vec::new();
@@ -59,10 +59,21 @@ pub(crate) fn read_text(path: &Path, limit: u64, action: &'static str) -> Result
         let reason = format!("longer than the limit of {limit} bytes");
         return Err(DatasetError::io(path, action, std::io::Error::other(reason)));
     }
-    // A byte-order mark is no part of the text.
-    let text = String::from_utf8(bytes)
-        .map_err(|e| DatasetError::io(path, action, std::io::Error::new(std::io::ErrorKind::InvalidData, e)))?;
-    Ok(text.strip_prefix('\u{feff}').map(str::to_string).unwrap_or(text))
+    Ok(bytes)
+}
+
+/// Reads a text file of at most `limit` bytes.
+pub(crate) fn read_text(path: &Path, limit: u64, action: &'static str) -> Result<String, DatasetError> {
+    let bytes = read_bytes(path, limit, action)?;
+    as_text(path, &bytes).map(str::to_string)
+}
+
+/// Bytes as text; a byte-order mark is no part of it.
+pub(crate) fn as_text<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a str, DatasetError> {
+    let text = std::str::from_utf8(bytes).map_err(|e| {
+        DatasetError::io(path, "read the file as text", std::io::Error::new(std::io::ErrorKind::InvalidData, e))
+    })?;
+    Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
 
 #[cfg(test)]

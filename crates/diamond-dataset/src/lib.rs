@@ -19,24 +19,44 @@
 //! assert_eq!(observation.radiance.shape(), (128, 128, 3));
 //! # Ok::<(), diamond_dataset::DatasetError>(())
 //! ```
+mod background;
 mod cache;
 mod capture;
+mod colmap;
+mod decode;
+mod develop;
 mod error;
 mod exclusions;
 mod field;
 mod folder;
+mod format;
 mod frames;
 mod geometry;
 mod hash;
+mod lens;
+mod lights;
 mod observation;
 mod scene;
 mod select;
 mod stored;
+mod views;
 mod write;
 
-pub use capture::{AlphaPremultiplied, Capture, EvalSplit, OpenOptions, Provenance, Shot, Split, TransferChoice, View};
+pub use capture::{
+    AlphaPremultiplied, Capture, EvalSplit, MaskSource, OpenOptions, Provenance, Shot, Split, TransferChoice, View,
+};
+pub use colmap::{
+    ColmapCamera, ColmapEncoding, ColmapImage, ColmapPoints, parse_colmap_cameras, parse_colmap_images,
+    parse_colmap_points, read_colmap_points,
+};
+pub use decode::decode_image;
+pub use develop::Undistortion;
 pub use error::{DatasetError, Place};
+pub use format::CaptureFormat;
+pub use frames::{Entry, Frame, Frames, parse_transforms};
 pub use geometry::Geometry;
+pub use lens::Lens;
+pub use lights::{LightEntry, LightFrame, Lights, parse_lights};
 pub use observation::{Observation, to_display};
 pub use scene::{Scene, light_direction};
 pub use select::{Selection, farthest_points};

@@ -3,8 +3,8 @@
 //! Stored samples are kept in the cache; an observation is computed from them on each request through a table with one
 //! entry per stored value. At 128² that takes a tenth of a millisecond and an image costs 64 KiB of cache instead of
 //! 300.
-use crate::stored::{Samples, StoredImage, read_stored};
-use crate::{AlphaPremultiplied, Capture, DatasetError, Shot};
+use crate::stored::{Samples, StoredImage};
+use crate::{AlphaPremultiplied, Capture, DatasetError, MaskSource, Shot};
 use diamond_image::{Image, Mask, Transfer};
 use std::sync::{Arc, OnceLock};
 
@@ -13,7 +13,7 @@ use std::sync::{Arc, OnceLock};
 pub struct Observation {
     /// Linear RGB radiance over black, that is multiplied by coverage; width × height × 3.
     pub radiance: Image,
-    /// Coverage from the alpha channel; `None` where the image has no alpha.
+    /// Coverage; `None` where nothing says which pixels show the object (see [`MaskSource`]).
     pub mask: Option<Mask>,
     /// Display sRGB over black, 8 bits, row-major RGB, width · height · 3 bytes: what metrics compare with. Where the
     /// file is 8-bit sRGB over black these are the bytes of the file.
@@ -23,17 +23,23 @@ pub struct Observation {
 impl Capture {
     /// Loads a shot of this capture. Thread-safe and deterministic: what was loaded before changes nothing but time.
     ///
-    /// Errors: the file is gone, cut short, no PNG, larger than [`crate::OpenOptions::max_pixels`], or its size is not
+    /// Errors: the file is gone, cut short, no image that can be read, larger than [`crate::OpenOptions::max_pixels`], or its size is not
     /// the frame's.
     pub fn observation(&self, shot: &Shot) -> Result<Arc<Observation>, DatasetError> {
         let stored = self.stored(shot)?;
-        let premultiplied = stored.alpha_channel().is_none() || self.alpha_premultiplied();
-        observe(&stored, self.options.transfer, premultiplied).map(Arc::new).map_err(|e| DatasetError::Image {
-            path: shot.path.clone(),
-            named_by: shot.named_by.clone().into(),
-            reason: e.to_string(),
-            advice: "export the image again",
-        })
+        observe(&stored, self.options.transfer, self.is_premultiplied(&stored))
+            .map(Arc::new)
+            .map_err(|e| self.unusable(shot, e.to_string()))
+    }
+
+    /// Whether the RGB of an image is already multiplied by its alpha.
+    pub(crate) fn is_premultiplied(&self, image: &StoredImage) -> bool {
+        match self.options.alpha_premultiplied {
+            _ if image.alpha_channel().is_none() => true,
+            AlphaPremultiplied::Auto => image.premultiplied.unwrap_or_else(|| self.alpha_premultiplied()),
+            AlphaPremultiplied::Yes => true,
+            AlphaPremultiplied::No => false,
+        }
     }
 
     /// Whether RGB is read as already multiplied by alpha: the option, or what the images say.
@@ -53,7 +59,17 @@ impl Capture {
             AlphaPremultiplied::Auto => *self.shared.premultiplied.get_or_init(|| {
                 let mut tally = Tally::default();
                 for shot in &self.shared.witnesses {
-                    if let Ok(stored) = self.stored(shot) {
+                    // A mask from a file says nothing about the alpha, and undistortion needs the answer first.
+                    if matches!(shot.mask, MaskSource::File(_)) {
+                        continue;
+                    }
+                    let stored = match shot.undistortion {
+                        None => self.stored(shot),
+                        Some(_) => self.read_shot(shot).map(Arc::new),
+                    };
+                    if let Ok(stored) = stored
+                        && stored.premultiplied.is_none()
+                    {
                         tally.add(&stored, self.options.transfer);
                     }
                 }
@@ -68,7 +84,12 @@ impl Capture {
     }
 
     pub(crate) fn stored(&self, shot: &Shot) -> Result<Arc<StoredImage>, DatasetError> {
-        self.shared.cache.get(&shot.path, || read_stored(shot, self.options.max_pixels))
+        // One file may be seen through two lenses, once in each split.
+        let key = match &shot.undistortion {
+            None => shot.path.clone(),
+            Some(lens) => shot.path.join(format!("{lens:?}")),
+        };
+        self.shared.cache.get(&key, || self.develop(shot))
     }
 }
 
@@ -84,7 +105,8 @@ const ROUNDING: f32 = 1.5 / 255.0;
 
 impl Tally {
     fn add(&mut self, stored: &StoredImage, transfer: Transfer) {
-        if stored.alpha_channel().is_none() {
+        // Linear images say themselves what they are.
+        if stored.alpha_channel().is_none() || matches!(stored.samples, Samples::Linear(_)) {
             return;
         }
         let pixels = 0..stored.width as usize * stored.height as usize;
@@ -144,7 +166,31 @@ pub(crate) fn observe(
         Samples::Sixteen(v) => {
             expand(stored, v, usize::from, 65535.0, decode_table(transfer, true), transfer, premultiplied)
         }
+        Samples::Linear(v) => expand_linear(stored, v, premultiplied),
     }
+}
+
+/// As [`expand`], of samples that are linear already.
+fn expand_linear(
+    stored: &StoredImage,
+    samples: &[f32],
+    premultiplied: bool,
+) -> Result<Observation, diamond_image::ImageError> {
+    let (width, height) = (stored.width as usize, stored.height as usize);
+    let colours = if stored.channels < 3 { [0, 0, 0] } else { [0, 1, 2] };
+    let alpha = stored.alpha_channel();
+    let mut radiance = Vec::with_capacity(width * height * 3);
+    let mut coverage = Vec::with_capacity(if alpha.is_some() { width * height } else { 0 });
+    for pixel in samples.chunks_exact(stored.channels) {
+        let a = alpha.map(|a| pixel[a]);
+        coverage.extend(a);
+        let factor = if premultiplied { 1.0 } else { a.unwrap_or(1.0) };
+        radiance.extend(colours.map(|c| pixel[c] * factor));
+    }
+    let radiance = Image::from_vec(width, height, 3, radiance)?;
+    let display = to_display(&radiance);
+    let mask = alpha.map(|_| Mask::from_vec(width, height, coverage)).transpose()?;
+    Ok(Observation { radiance, mask, display })
 }
 
 fn expand<T: Copy>(
@@ -220,7 +266,8 @@ mod tests {
         let o = observe(&stored, Transfer::Linear, true).unwrap();
         assert_eq!(o.radiance.pixel(0, 0), [64.0 / 255.0; 3]);
         assert!(o.mask.is_none());
-        let sixteen = StoredImage { width: 1, height: 1, channels: 2, samples: Samples::Sixteen(vec![65535, 32768]) };
+        let samples = Samples::Sixteen(vec![65535, 32768]);
+        let sixteen = StoredImage { width: 1, height: 1, channels: 2, samples, premultiplied: None };
         let o = observe(&sixteen, Transfer::Gamma22, true).unwrap();
         assert_eq!(o.radiance.pixel(0, 0), [1.0; 3]);
         assert!((o.mask.unwrap().coverage(0, 0) - 0.5).abs() < 1e-4);

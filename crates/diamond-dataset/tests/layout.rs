@@ -166,7 +166,8 @@ fn one_image_per_frame_is_grouped_into_views() {
     assert_eq!(shot.light, OlatLight::Directional { direction: Vec3::Z, irradiance: Vec3::splat(3.0) });
     assert_eq!(shot.provenance, Provenance::Synthetic { method: "relight".into() });
     assert_eq!((shot.weight, shot.light_index), (0.5, 1));
-    assert!(capture.notes.iter().any(|n| n.contains("distortion k1")));
+    assert!(capture.notes.iter().any(|n| n.contains("3 of 3 images are undistorted")), "{:?}", capture.notes);
+    assert_eq!(capture.format, CaptureFormat::Nerfstudio);
 }
 
 #[test]

@@ -16,6 +16,8 @@ mod bilinear;
 mod image;
 mod luminance;
 mod mask;
+mod morphology;
+mod remap;
 mod resize;
 mod transfer;
 
