@@ -200,8 +200,7 @@ impl Distortion {
                 (s, (self.slope(r) - s) / r2)
             }
         };
-        let (mut j00, mut j01, mut j10, mut j11) =
-            (s + outer * x * x, outer * x * y, outer * x * y, s + outer * y * y);
+        let (mut j00, mut j01, mut j10, mut j11) = (s + outer * x * x, outer * x * y, outer * x * y, s + outer * y * y);
         if let Distortion::Brown { p1, p2, .. } = *self {
             j00 += 2.0 * p1 * y + 6.0 * p2 * x;
             j01 += 2.0 * p1 * x + 2.0 * p2 * y;

@@ -208,8 +208,8 @@ impl Capture {
     /// `transforms_train.json` alone.
     ///
     /// `lights.json` in the folder gives lights to images whose format has none (see docs/formats.md).
-    /// `exclude_list.txt` in the folder names images to leave out, one per line: a path or a bare name, with or without
-    /// extension; `#` begins a comment.
+    /// `held_out_list.txt` names the images of a nerfstudio or COLMAP capture to hold out, `exclude_list.txt` names images to leave out, one per line: a
+    /// path or a bare name, with or without extension; `#` begins a comment.
     ///
     /// Frames that list no image are left out with a note. An image may be named once per split; the same image in both
     /// splits is noted, since it makes the evaluation meaningless.
@@ -223,18 +223,23 @@ impl Capture {
             notes.push(found.why.clone());
         }
         let (file, train_frames, test_frames) = read_source(&found, &mut documents)?;
-        let excluded = Exclusions::read(root, &mut documents)?;
+        let excluded = Exclusions::read(root, "exclude_list.txt", &mut documents)?;
         if let Source::Transforms { test, .. } = &found.source {
             documents.extend(test.clone());
         }
         let lights = read_lights(root, &mut documents)?;
+        let held_out = match found.may_hold_out {
+            true => Exclusions::read(root, "held_out_list.txt", &mut documents)?,
+            false => Exclusions::default(),
+        };
         let image_folders: &[&str] = match found.format {
             CaptureFormat::Colmap => &["images", "image", "input", "."],
             CaptureFormat::Blender | CaptureFormat::Nerfstudio => &["."],
         };
         let lights = lights.as_ref();
         let context = Context { root, file: &file, image_folders, excluded: &excluded, lights, options };
-        let (mut train, mut test) = split(&context, &found, &train_frames, test_frames.as_ref(), &mut notes)?;
+        let (mut train, mut test) =
+            split(&context, &found, &train_frames, test_frames.as_ref(), &held_out, &mut notes)?;
         context.find_geometry(&mut train);
         context.find_geometry(&mut test);
         if test.is_empty() {
@@ -254,7 +259,8 @@ impl Capture {
         let points = find_points(&found, &train_frames, &mut notes)?;
         documents.extend(points.clone().filter(|p| !documents.contains(p)));
         let images = all_images(&train, &test, &mut notes);
-        let beside: BTreeSet<PathBuf> = train.iter().chain(&test).flat_map(|v| &v.shots).filter_map(mask_file).collect();
+        let beside: BTreeSet<PathBuf> =
+            train.iter().chain(&test).flat_map(|v| &v.shots).filter_map(mask_file).collect();
         documents.extend(beside);
         Ok(Capture {
             shared: Arc::new(Shared {
@@ -285,10 +291,7 @@ impl Capture {
 }
 
 /// The file that describes the training images, its frames, and those of the held-out images where a file has them.
-fn read_source(
-    found: &Found,
-    documents: &mut Vec<PathBuf>,
-) -> Result<(PathBuf, Frames, Option<Frames>), DatasetError> {
+fn read_source(found: &Found, documents: &mut Vec<PathBuf>) -> Result<(PathBuf, Frames, Option<Frames>), DatasetError> {
     match &found.source {
         Source::Transforms { train, test } => {
             documents.push(train.clone());
@@ -323,6 +326,7 @@ fn split(
     found: &Found,
     frames: &Frames,
     held_out: Option<&Frames>,
+    listed: &Exclusions,
     notes: &mut Vec<String>,
 ) -> Result<(Vec<View>, Vec<View>), DatasetError> {
     notes.extend(frames.notes.iter().cloned());
@@ -331,9 +335,19 @@ fn split(
         let train = context.build(frames, Split::Train, &|_| true)?;
         return Ok((train, context.build(held_out, Split::Test, &|_| true)?));
     }
+    if !listed.is_empty() {
+        let is_test = |frame: &Frame| frame.entries.iter().any(|e| listed.contains(&e.file));
+        let test = context.build(frames, Split::Test, &is_test)?;
+        let train = context.build(frames, Split::Train, &|frame| !is_test(frame))?;
+        listed.note_unused(notes);
+        notes.push(format!("held-out images are those of held_out_list.txt: {} views", test.len()));
+        return Ok((train, test));
+    }
     if let Some(test_files) = frames.test_files.as_ref().filter(|_| found.may_hold_out) {
         let named = |list: &[String], frame: &Frame| {
-            let is = |a: &str, b: &str| strip_extension(a.trim_start_matches("./")) == strip_extension(b.trim_start_matches("./"));
+            let is = |a: &str, b: &str| {
+                strip_extension(a.trim_start_matches("./")) == strip_extension(b.trim_start_matches("./"))
+            };
             frame.entries.iter().any(|e| list.iter().any(|f| is(f, &e.file)))
         };
         let is_test = |frame: &Frame| named(test_files, frame);
@@ -374,7 +388,14 @@ fn find_points(found: &Found, frames: &Frames, notes: &mut Vec<String>) -> Resul
         return Ok(Some(ply));
     }
     match &found.source {
-        Source::Colmap(model) => Ok(model.points.clone()),
+        Source::Colmap(model) => {
+            let Some(path) = &model.points else { return Ok(None) };
+            let none = crate::read_colmap_points(path)?.positions.is_empty();
+            if none {
+                notes.push(format!("{} holds no points: no initial points", path.display()));
+            }
+            Ok((!none).then(|| path.clone()))
+        }
         Source::Transforms { train, .. } => {
             let Some(named) = &frames.points else { return Ok(None) };
             let place = Place { file: train.clone(), frame: None, field: Some("ply_file_path".into()) };

@@ -49,7 +49,10 @@ impl Kind {
             [0x76, 0x2f, 0x31, 0x01, ..] => Ok(Kind::Exr),
             _ => {
                 let start: Vec<String> = bytes.iter().take(8).map(|b| format!("{b:02x}")).collect();
-                Err(format!("neither PNG, JPEG nor EXR: no header of theirs (the file begins with [{}])", start.join(" ")))
+                Err(format!(
+                    "neither PNG, JPEG nor EXR: no header of theirs (the file begins with [{}])",
+                    start.join(" ")
+                ))
             }
         }
     }
@@ -163,13 +166,11 @@ pub(crate) fn decode(bytes: &[u8], options: &DecodeOptions) -> Result<StoredImag
     if kind == Kind::Exr {
         return decode_exr(bytes, (width, height), options).map_err(Refusal::Broken);
     }
-    let bad = |e: image::ImageError| {
-        Refusal::Broken(format!("cannot decode the {} ({e}); is it cut short?", kind.name()))
-    };
+    let bad =
+        |e: image::ImageError| Refusal::Broken(format!("cannot decode the {} ({e}); is it cut short?", kind.name()));
     let allowed = || limits(pixels * DECODER_BYTES_PER_PIXEL + DECODER_BYTES_BESIDES);
     let image = if kind == Kind::Png {
-        let mut decoder =
-            PngDecoder::with_limits(Cursor::new(bytes), limits(DECODER_BYTES_BESIDES)).map_err(bad)?;
+        let mut decoder = PngDecoder::with_limits(Cursor::new(bytes), limits(DECODER_BYTES_BESIDES)).map_err(bad)?;
         decoder.set_limits(allowed()).map_err(bad)?;
         DynamicImage::from_decoder(decoder)
     } else {
@@ -202,7 +203,9 @@ fn decode_exr(bytes: &[u8], (width, height): (u32, u32), options: &DecodeOptions
         let (size, channels) = (header.layer_size, header.channels.list.len());
         let samples = (size.0 as u64).saturating_mul(size.1 as u64).saturating_mul(channels as u64);
         let allowed = options.max_pixels.saturating_mul(4 + channels as u64 / 4);
-        if channels > MAX_EXR_CHANNELS || samples > allowed || samples / 8 > (bytes.len() as u64).saturating_mul(MAX_RATIO)
+        if channels > MAX_EXR_CHANNELS
+            || samples > allowed
+            || samples / 8 > (bytes.len() as u64).saturating_mul(MAX_RATIO)
         {
             return Err(format!(
                 "a layer of {}×{} pixels with {channels} channels is more than the limits or the file allow",
@@ -227,12 +230,13 @@ fn decode_exr(bytes: &[u8], (width, height): (u32, u32), options: &DecodeOptions
         // No prefix first, then those of "prefix.R" and "prefix.Y" in the order of the file.
         let behind = names.iter().filter_map(|n| n.strip_suffix("R").or_else(|| n.strip_suffix("Y")));
         let mut prefixes = std::iter::once("").chain(behind.filter(|p| p.ends_with('.')));
-        let Some((prefix, colours)) = prefixes.find_map(|p| match (find(p, "R"), find(p, "G"), find(p, "B"), find(p, "Y"))
-        {
-            (Some(r), Some(g), Some(b), _) => Some((p, vec![r, g, b])),
-            (None, None, None, Some(y)) => Some((p, vec![y])),
-            _ => None,
-        }) else {
+        let Some((prefix, colours)) =
+            prefixes.find_map(|p| match (find(p, "R"), find(p, "G"), find(p, "B"), find(p, "Y")) {
+                (Some(r), Some(g), Some(b), _) => Some((p, vec![r, g, b])),
+                (None, None, None, Some(y)) => Some((p, vec![y])),
+                _ => None,
+            })
+        else {
             seen.extend(names);
             continue;
         };

@@ -1,10 +1,13 @@
-//! `exclude_list.txt`: images of a capture that are left out.
+//! Lists of images: `exclude_list.txt`, what is left out, and `held_out_list.txt`, what is held out for evaluation.
 use crate::{DatasetError, folder};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The names in `exclude_list.txt`, and which of them were met.
+/// The names in such a list, and which of them were met.
+#[derive(Default)]
 pub(crate) struct Exclusions {
+    /// The file.
+    file: &'static str,
     names: BTreeSet<String>,
     used: std::cell::RefCell<BTreeSet<String>>,
 }
@@ -34,19 +37,24 @@ pub(crate) fn strip_extension(name: &str) -> &str {
 }
 
 impl Exclusions {
-    /// Reads the list of a folder, if there is one, and adds it to the documents.
-    pub(crate) fn read(root: &Path, documents: &mut Vec<PathBuf>) -> Result<Self, DatasetError> {
-        let path = root.join("exclude_list.txt");
+    /// Reads the list called `file` in a folder, if there is one, and adds it to the documents.
+    pub(crate) fn read(root: &Path, file: &'static str, documents: &mut Vec<PathBuf>) -> Result<Self, DatasetError> {
+        let path = root.join(file);
         let mut names = BTreeSet::new();
         if path.is_file() {
-            let text = folder::read_text(&path, MAX_EXCLUDE_BYTES, "read the list of excluded images")?;
+            let text = folder::read_text(&path, MAX_EXCLUDE_BYTES, "read the list of images")?;
             names.extend(text.lines().map(|l| plain_name(l.split('#').next().unwrap_or(""))).filter(|n| !n.is_empty()));
             documents.push(path);
         }
-        Ok(Self { names, used: Default::default() })
+        Ok(Self { file, names, used: Default::default() })
     }
 
-    /// Whether the image that a frame names is to be left out.
+    /// Whether there is no such list, or an empty one.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.names.is_empty()
+    }
+
+    /// Whether the list names an image as a frame writes it.
     pub(crate) fn contains(&self, written: &str) -> bool {
         let full = plain_name(written);
         let stem = full.rsplit('/').next().unwrap_or_default().to_string();
@@ -60,7 +68,7 @@ impl Exclusions {
     pub(crate) fn note_unused(&self, notes: &mut Vec<String>) {
         let used = self.used.borrow();
         for name in self.names.iter().filter(|name| !used.contains(*name)) {
-            notes.push(format!("exclude_list.txt: \"{name}\" names no image of this capture"));
+            notes.push(format!("{}: \"{name}\" names no image of this capture", self.file));
         }
     }
 }

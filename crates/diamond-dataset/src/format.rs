@@ -164,10 +164,14 @@ fn find_in(root: &Path, wanted: Option<CaptureFormat>, eval: EvalSplit) -> Resul
              in sparse, sparse/0 or colmap/sparse/0; is this the capture's folder?"
         ),
         Some(CaptureFormat::Blender) => format!("the format blender was asked for, but the folder holds no {TRAIN}"),
-        Some(CaptureFormat::Nerfstudio) => format!("the format nerfstudio was asked for, but the folder holds no {SINGLE}"),
-        Some(CaptureFormat::Colmap) => "the format colmap was asked for, but neither the folder nor its sparse, sparse/0 \
+        Some(CaptureFormat::Nerfstudio) => {
+            format!("the format nerfstudio was asked for, but the folder holds no {SINGLE}")
+        }
+        Some(CaptureFormat::Colmap) => {
+            "the format colmap was asked for, but neither the folder nor its sparse, sparse/0 \
                                         and colmap/sparse/0 hold cameras and images, both .bin or both .txt"
-            .to_string(),
+                .to_string()
+        }
     };
     Err(DatasetError::io(root, "open the capture", std::io::Error::other(reason)))
 }

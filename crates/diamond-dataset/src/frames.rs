@@ -166,8 +166,7 @@ fn parse_entries(frame: &Object) -> Result<Vec<Entry>, DatasetError> {
         }
         Ok(items)
     };
-    let names =
-        ["light_positions", "light_directions", "light_intensities", "weights", "provenances", "mask_paths"];
+    let names = ["light_positions", "light_directions", "light_intensities", "weights", "provenances", "mask_paths"];
     let mut columns = [None; 6];
     for (slot, name) in columns.iter_mut().zip(names) {
         *slot = column(name)?;

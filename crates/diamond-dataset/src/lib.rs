@@ -41,6 +41,7 @@ mod select;
 mod stored;
 mod views;
 mod write;
+mod write_other;
 
 pub use capture::{
     AlphaPremultiplied, Capture, EvalSplit, MaskSource, OpenOptions, Provenance, Shot, Split, TransferChoice, View,
@@ -61,3 +62,4 @@ pub use observation::{Observation, to_display};
 pub use scene::{Scene, light_direction};
 pub use select::{Selection, farthest_points};
 pub use write::{BitDepth, CaptureDescription, Pixels, ShotDescription, ViewDescription, write_capture};
+pub use write_other::{write_colmap, write_nerfstudio};

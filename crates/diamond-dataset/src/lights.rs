@@ -99,7 +99,8 @@ pub fn parse_lights(path: &Path, bytes: &[u8]) -> Result<Lights, DatasetError> {
                         for (k, item) in list.iter().enumerate() {
                             let light = parse_light_entry(path, item, &format!("{at}[{k}]"), frame)?;
                             if light.image.is_none() {
-                                let advice = "name the photograph that this light made, relative to the capture's folder";
+                                let advice =
+                                    "name the photograph that this light made, relative to the capture's folder";
                                 return Err(top.error(format!("{at}[{k}].image"), "a path", "nothing", advice));
                             }
                             lights.push(light);
@@ -220,8 +221,7 @@ impl Lights {
     /// Notes rules that named no image.
     pub(crate) fn note_unused(&self, notes: &mut Vec<String>) {
         let used = self.used.borrow();
-        for (i, (key, _)) in self.rules.iter().enumerate().filter(|(i, _)| !used.contains(i)) {
-            let _ = i;
+        for (_, (key, _)) in self.rules.iter().enumerate().filter(|(i, _)| !used.contains(i)) {
             notes.push(format!("lights.json: \"{key}\" names no image of this capture"));
         }
     }
@@ -241,9 +241,7 @@ impl LightEntry {
         let (point, vector): (&dyn Fn(glam::Vec3) -> glam::Vec3, &dyn Fn(glam::Vec3) -> glam::Vec3) =
             match (self.frame, applied) {
                 (LightFrame::World, _) => return Ok(self.light),
-                (LightFrame::Camera, _) => {
-                    (&|p| pose.inverse_transform_point(p), &|d| pose.rotation.transpose() * d)
-                }
+                (LightFrame::Camera, _) => (&|p| pose.inverse_transform_point(p), &|d| pose.rotation.transpose() * d),
                 (LightFrame::Original, Some(m)) => (&|p| m.transform_point3(p), &|d| m.transform_vector3(d)),
                 (LightFrame::Original, None) => {
                     let advice = "write \"frame\": \"world\", or add the transform to transforms.json";
@@ -259,7 +257,9 @@ impl LightEntry {
                 irradiance,
             },
         };
-        light.validate().map_err(|e| no("a light that is finite in world axes", &e.to_string(), "correct the light"))?;
+        light
+            .validate()
+            .map_err(|e| no("a light that is finite in world axes", &e.to_string(), "correct the light"))?;
         Ok(light)
     }
 }
@@ -285,7 +285,10 @@ mod tests {
             OlatLight::Point { position, .. } => position.x,
             _ => f32::NAN,
         };
-        assert_eq!([x("images/a.png"), x("abc.jpg"), x("x/r_0_l_3.png"), x("sub/b.exr"), x("z")], [1.0, 2.0, 3.0, 4.0, 0.0]);
+        assert_eq!(
+            [x("images/a.png"), x("abc.jpg"), x("x/r_0_l_3.png"), x("sub/b.exr"), x("z")],
+            [1.0, 2.0, 3.0, 4.0, 0.0]
+        );
         assert_eq!(x("a_l_3"), 3.0, "more fixed letters");
         let mut notes = vec![];
         lights(r#"{"images": {"q": {"direction": [0, 0, 1]}}}"#).unwrap().note_unused(&mut notes);
@@ -297,9 +300,11 @@ mod tests {
 
     #[test]
     fn a_light_fixed_to_the_camera_moves_with_it() {
-        let l = lights(r#"{"frame": "camera", "default": {"position": [0, 0, 1]}, "images": {
+        let l = lights(
+            r#"{"frame": "camera", "default": {"position": [0, 0, 1]}, "images": {
             "far": {"direction": [0, 0, -1], "intensity": 2}, "w": {"frame": "world", "position": [7, 8, 9]},
-            "o": {"frame": "original", "position": [1, 2, 3]}}}"#)
+            "o": {"frame": "original", "position": [1, 2, 3]}}}"#,
+        )
         .unwrap();
         let pose = Pose::look_at(Vec3::new(4.0, 0.0, 0.0), Vec3::ZERO, Vec3::Z);
         let at = |name: &str, applied| l.of(name).unwrap().unwrap()[0].in_world(&pose, applied);
@@ -309,7 +314,12 @@ mod tests {
         assert!(direction.distance(Vec3::X) < 1e-6 && irradiance == Vec3::splat(2.0), "back to the camera");
         assert_eq!(at("w", None).unwrap().position(), Some(Vec3::new(7.0, 8.0, 9.0)));
         assert!(at("o", None).unwrap_err().to_string().contains("applied_transform"));
-        let swap = Mat4::from_cols_array_2d(&[[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]);
+        let swap = Mat4::from_cols_array_2d(&[
+            [0.0, 1.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, -1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]);
         assert_eq!(at("o", Some(&swap)).unwrap().position(), Some(Vec3::new(2.0, 1.0, -3.0)));
     }
 

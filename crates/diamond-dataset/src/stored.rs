@@ -75,9 +75,7 @@ impl StoredImage {
         }
         let (from, c) = (self.channels, coverage.iter());
         let samples = match &self.samples {
-            Samples::Eight(v) => {
-                Samples::Eight(interleave(v, from, colours, c.map(|&c| (c * 255.0).round() as u8)))
-            }
+            Samples::Eight(v) => Samples::Eight(interleave(v, from, colours, c.map(|&c| (c * 255.0).round() as u8))),
             Samples::Sixteen(v) => {
                 Samples::Sixteen(interleave(v, from, colours, c.map(|&c| (c * 65535.0).round() as u16)))
             }

@@ -84,9 +84,8 @@ impl Context<'_> {
             }
             // In the NeRF layout each image is a frame of its own: frames with the same camera are one view.
             if frame.entries.len() == 1
-                && let Some(view) = views
-                    .iter_mut()
-                    .find(|view| view.camera == camera && view.shots[0].undistortion == undistortion)
+                && let Some(view) =
+                    views.iter_mut().find(|view| view.camera == camera && view.shots[0].undistortion == undistortion)
             {
                 shots.iter_mut().enumerate().for_each(|(i, shot)| shot.light_index = view.shots.len() + i);
                 view.shots.append(&mut shots);
@@ -171,10 +170,8 @@ impl Context<'_> {
         // A name with another extension: decoding will say that it cannot be read.
         let other = folder::resolve(self.root, written, place).ok().filter(|p| !complete && p.is_file());
         other.ok_or_else(|| {
-            first_error.unwrap_or_else(|| DatasetError::Outside {
-                place: place.clone().into(),
-                path: written.to_string(),
-            })
+            first_error
+                .unwrap_or_else(|| DatasetError::Outside { place: place.clone().into(), path: written.to_string() })
         })
     }
 
@@ -214,9 +211,8 @@ impl Context<'_> {
     /// Where photographs of the background are there, shots without a mask of their own get the most specific.
     fn assign_backgrounds(&self, views: &mut [View]) {
         let place = Place::file(self.file);
-        let find = |name: &str| {
-            EXTENSIONS.iter().find_map(|e| folder::resolve(self.root, &format!("{name}{e}"), &place).ok())
-        };
+        let find =
+            |name: &str| EXTENSIONS.iter().find_map(|e| folder::resolve(self.root, &format!("{name}{e}"), &place).ok());
         let (common, folder) = (find("background"), self.root.join("background").is_dir());
         if common.is_none() && !folder {
             return;
@@ -287,4 +283,3 @@ fn make_names_unique(root: &Path, views: &mut [View]) {
         }
     }
 }
-

@@ -1,4 +1,4 @@
-//! Writing a capture in the SSS-3DGS layout, so that a folder is either whole or not there.
+//! Writing a capture in the SSS-3DGS layout, so that a folder is either whole or not there. Other formats: `write_other.rs`.
 use crate::{Capture, DatasetError, OpenOptions, Place, Provenance, Split};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask, Transfer};
@@ -74,6 +74,15 @@ pub fn write_capture(
     description: &CaptureDescription,
     mut pixels: impl FnMut(Split, usize, usize) -> Result<Pixels, DatasetError>,
 ) -> Result<(), DatasetError> {
+    whole_or_absent(dir, description, |folder| write_into(folder, description, &mut pixels))
+}
+
+/// Lets `write` fill a hidden folder beside `dir`, and renames it to `dir` when all of it is on disk.
+pub(crate) fn whole_or_absent(
+    dir: &Path,
+    description: &CaptureDescription,
+    write: impl FnOnce(&Path) -> Result<(), DatasetError>,
+) -> Result<(), DatasetError> {
     let refuse = |reason: &str| DatasetError::Write { path: dir.to_path_buf(), reason: reason.to_string() };
     if dir.symlink_metadata().is_ok() {
         return Err(refuse("the folder exists already; choose another, or remove it"));
@@ -89,7 +98,7 @@ pub fn write_capture(
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(DatasetError::io(&temporary, "clear the folder", e)),
         _ => Ok(()),
     };
-    let written = cleared.and_then(|()| write_into(&temporary, description, &mut pixels)).and_then(|()| {
+    let written = cleared.and_then(|()| write(&temporary)).and_then(|()| {
         std::fs::rename(&temporary, dir).map_err(|e| DatasetError::io(dir, "rename the finished capture", e))?;
         sync_folder(parent)
     });
@@ -105,16 +114,14 @@ fn write_into(
     description: &CaptureDescription,
     pixels: &mut impl FnMut(Split, usize, usize) -> Result<Pixels, DatasetError>,
 ) -> Result<(), DatasetError> {
-    let create =
-        |path: &Path| std::fs::create_dir_all(path).map_err(|e| DatasetError::io(path, "create the folder", e));
-    create(dir)?;
+    create_folder(dir)?;
     for (split, folder, views) in
         [(Split::Train, "train", &description.train), (Split::Test, "test", &description.test)]
     {
         if views.is_empty() {
             continue;
         }
-        create(&dir.join(folder))?;
+        create_folder(&dir.join(folder))?;
         let mut names = BTreeSet::new();
         let mut frames = Vec::new();
         for (v, view) in views.iter().enumerate() {
@@ -132,11 +139,74 @@ fn write_into(
         write_synced(&dir.join(format!("transforms_{folder}.json")), format!("{json:#}\n").as_bytes())?;
         sync_folder(&dir.join(folder))?;
     }
-    if let Some(points) = &description.points {
-        let bytes = std::fs::read(points).map_err(|e| DatasetError::io(points, "read the point cloud", e))?;
-        write_synced(&dir.join("points3d.ply"), &bytes)?;
-    }
+    write_points(dir, description)?;
     sync_folder(dir)
+}
+
+pub(crate) fn create_folder(path: &Path) -> Result<(), DatasetError> {
+    std::fs::create_dir_all(path).map_err(|e| DatasetError::io(path, "create the folder", e))
+}
+
+/// Copies the point cloud to `points3d.ply`; the points of a COLMAP model become one.
+pub(crate) fn write_points(dir: &Path, description: &CaptureDescription) -> Result<(), DatasetError> {
+    let Some(points) = &description.points else { return Ok(()) };
+    let bytes = if points.extension().is_some_and(|e| e == "bin" || e == "txt") {
+        let cloud = crate::read_colmap_points(points)?;
+        let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", cloud.positions.len());
+        for axis in ["x", "y", "z"] {
+            text += &format!("property float {axis}\n");
+        }
+        for colour in ["red", "green", "blue"] {
+            text += &format!("property uchar {colour}\n");
+        }
+        text += "end_header\n";
+        for (p, [r, g, b]) in cloud.positions.iter().zip(&cloud.colours) {
+            text += &format!("{} {} {} {r} {g} {b}\n", p.x, p.y, p.z);
+        }
+        text.into_bytes()
+    } else {
+        std::fs::read(points).map_err(|e| DatasetError::io(points, "read the point cloud", e))?
+    };
+    write_synced(&dir.join("points3d.ply"), &bytes)
+}
+
+/// Three or four numbers as JSON.
+pub(crate) fn numbers(v: &[f32]) -> Value {
+    Value::from(v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>())
+}
+
+/// The text of a provenance.
+pub(crate) fn provenance_text(p: &Provenance) -> String {
+    match p {
+        Provenance::Photograph => "photograph".to_string(),
+        Provenance::Synthetic { method } => format!("synthetic:{method}"),
+    }
+}
+
+/// Refuses names that no file can have, names that are taken, and lights and weights that are not finite.
+pub(crate) fn check_shot(
+    folder: &Path,
+    shot: &ShotDescription,
+    names: &mut BTreeSet<String>,
+) -> Result<(), DatasetError> {
+    let refuse = |reason: String| DatasetError::Write { path: folder.join(&shot.name), reason };
+    let usable = |c: char| c.is_ascii_alphanumeric() || "_-.+".contains(c);
+    if shot.name.is_empty() || shot.name.starts_with('.') || !shot.name.chars().all(usable) {
+        return Err(refuse(format!("\"{}\" is no usable file name; use letters, digits, _ - . +", shot.name)));
+    }
+    // Case-insensitive file systems would merge names that differ in case only.
+    if !names.insert(shot.name.to_ascii_lowercase()) {
+        return Err(refuse("two images of this split have this name; make names unique".into()));
+    }
+    let (at, intensity) = match shot.light {
+        OlatLight::Point { position, intensity } => (position, intensity),
+        OlatLight::Directional { direction, irradiance } => (direction, irradiance),
+    };
+    let finite = at.is_finite() && intensity.is_finite() && intensity.min_element() >= 0.0;
+    if !finite || !shot.weight.is_finite() || shot.weight < 0.0 {
+        return Err(refuse(format!("light {:?} or weight {} is not finite or negative", shot.light, shot.weight)));
+    }
+    Ok(())
 }
 
 fn frame_json(
@@ -146,32 +216,16 @@ fn frame_json(
     names: &mut BTreeSet<String>,
 ) -> Result<Value, DatasetError> {
     let mut frame = Map::new();
-    let numbers = |v: &[f32]| Value::from(v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>());
     let directional = view.shots.iter().any(|shot| matches!(shot.light, OlatLight::Directional { .. }));
     let (mut positions, mut directions, mut intensities) = (Vec::new(), Vec::new(), Vec::new());
     for shot in &view.shots {
-        let refuse = |reason: String| DatasetError::Write { path: dir.join(folder).join(&shot.name), reason };
-        let usable = |c: char| c.is_ascii_alphanumeric() || "_-.+".contains(c);
-        if shot.name.is_empty() || shot.name.starts_with('.') || !shot.name.chars().all(usable) {
-            return Err(refuse(format!("\"{}\" is no usable file name; use letters, digits, _ - . +", shot.name)));
-        }
-        // Case-insensitive file systems would merge names that differ in case only.
-        if !names.insert(shot.name.to_ascii_lowercase()) {
-            return Err(refuse("two images of this split have this name; make names unique".into()));
-        }
+        check_shot(&dir.join(folder), shot, names)?;
         let (position, direction, intensity) = match shot.light {
             OlatLight::Point { position, intensity } => (numbers(&position.to_array()), Value::Null, intensity),
             OlatLight::Directional { direction, irradiance } => {
                 (Value::Null, numbers(&direction.to_array()), irradiance)
             }
         };
-        let finite = match shot.light {
-            OlatLight::Point { position, intensity } => position.is_finite() && intensity.is_finite(),
-            OlatLight::Directional { direction, irradiance } => direction.is_finite() && irradiance.is_finite(),
-        };
-        if !finite || !shot.weight.is_finite() || shot.weight < 0.0 || intensity.min_element() < 0.0 {
-            return Err(refuse(format!("light {:?} or weight {} is not finite or negative", shot.light, shot.weight)));
-        }
         positions.push(position);
         directions.push(direction);
         intensities.push(numbers(&intensity.to_array()));
@@ -189,11 +243,8 @@ fn frame_json(
         frame.insert("weights".into(), view.shots.iter().map(|shot| Value::from(f64::from(shot.weight))).collect());
     }
     if view.shots.iter().any(|shot| shot.provenance != Provenance::Photograph) {
-        let text = |p: &Provenance| match p {
-            Provenance::Photograph => "photograph".to_string(),
-            Provenance::Synthetic { method } => format!("synthetic:{method}"),
-        };
-        frame.insert("provenances".into(), view.shots.iter().map(|shot| Value::from(text(&shot.provenance))).collect());
+        let texts = view.shots.iter().map(|shot| Value::from(provenance_text(&shot.provenance)));
+        frame.insert("provenances".into(), texts.collect());
     }
     let matrix = view.camera.pose.to_opengl_camera_to_world().transpose().to_cols_array_2d();
     frame.insert("transform_matrix".into(), matrix.iter().map(|row| numbers(row)).collect());
@@ -207,7 +258,7 @@ fn frame_json(
 }
 
 /// An image as a PNG file.
-fn encode(
+pub(crate) fn encode(
     path: &Path,
     camera: &Camera,
     (radiance, mask): &Pixels,
@@ -246,7 +297,7 @@ fn encode(
     Ok(bytes.into_inner())
 }
 
-fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
+pub(crate) fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
     let io = |e| DatasetError::io(path, "write the file", e);
     let mut file = File::create(path).map_err(io)?;
     file.write_all(bytes).map_err(io)?;
@@ -254,7 +305,7 @@ fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
 }
 
 /// Makes the names in a folder durable. Only Unix can open a folder for that; elsewhere the rename has to do.
-fn sync_folder(dir: &Path) -> Result<(), DatasetError> {
+pub(crate) fn sync_folder(dir: &Path) -> Result<(), DatasetError> {
     if cfg!(unix) {
         File::open(dir).and_then(|f| f.sync_all()).map_err(|e| DatasetError::io(dir, "synchronise the folder", e))?;
     }
@@ -307,6 +358,7 @@ impl CaptureDescription {
         OpenOptions {
             transfer: self.transfer,
             alpha_premultiplied: crate::AlphaPremultiplied::Yes,
+            hold_out_every: 0,
             ..OpenOptions::default()
         }
     }

@@ -141,7 +141,8 @@ mod tests {
                 (0..35)
                     .map(|i: usize| {
                         let (x, y) = (i % 7, i / 7);
-                        let near = (0..35usize).filter(|j| (j % 7).abs_diff(x) <= radius && (j / 7).abs_diff(y) <= radius);
+                        let near =
+                            (0..35usize).filter(|j| (j % 7).abs_diff(x) <= radius && (j / 7).abs_diff(y) <= radius);
                         let mut values = near.map(|j| m.data()[j] >= 0.5);
                         f32::from(if any { values.any(|v| v) } else { values.all(|v| v) })
                     })

@@ -80,14 +80,58 @@ impl StoredTransfer {
     }
 }
 
+/// How a capture is written down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InputFormat {
+    /// What the folder holds.
+    #[default]
+    Auto,
+    /// `transforms_train.json`.
+    Blender,
+    /// `transforms.json`.
+    Nerfstudio,
+    /// A COLMAP model.
+    Colmap,
+}
+
+impl InputFormat {
+    /// The format that was asked for, if one was.
+    pub fn format(self) -> Option<diamond_dataset::CaptureFormat> {
+        match self {
+            InputFormat::Auto => None,
+            InputFormat::Blender => Some(diamond_dataset::CaptureFormat::Blender),
+            InputFormat::Nerfstudio => Some(diamond_dataset::CaptureFormat::Nerfstudio),
+            InputFormat::Colmap => Some(diamond_dataset::CaptureFormat::Colmap),
+        }
+    }
+}
+
 /// How images are read.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Input {
-    /// Transfer of the stored images.
+    /// Format of the capture.
+    #[serde(default)]
+    pub format: InputFormat,
+    /// Transfer of EXR images.
+    #[serde(default = "linear")]
+    pub exr_transfer: StoredTransfer,
+    /// Every so manyth view of a nerfstudio or COLMAP capture is held out if the capture holds none out; 0 holds none out.
+    #[serde(default = "eighth")]
+    pub hold_out_every: usize,
+    /// Transfer of the stored PNG and JPEG images.
     pub transfer: StoredTransfer,
     /// Bytes that decoded images may occupy at a time.
     pub cache_bytes: usize,
+}
+
+fn linear() -> StoredTransfer {
+    StoredTransfer::Linear
+}
+
+fn eighth() -> usize {
+    8
 }
 
 /// Where the first Gaussians come from.

@@ -124,6 +124,17 @@ fn uniform(centre: Vec3, radius: f32, config: &Config) -> InitialPoints {
     InitialPoints { positions, normals, origin: "uniform in the bounds".into() }
 }
 
+/// The point cloud of a capture: a PLY file, or the points of a COLMAP model.
+fn read_points(path: &std::path::Path) -> Result<PointCloud, ReconstructError> {
+    if path.extension().is_some_and(|e| e == "bin" || e == "txt") {
+        let points = diamond_dataset::read_colmap_points(path)?;
+        let colour = |rgb: &[u8; 3]| Vec3::from(rgb.map(|v| f32::from(v) / 255.0));
+        let colors = Some(points.colours.iter().map(colour).collect());
+        return Ok(PointCloud { positions: points.positions, normals: None, colors });
+    }
+    PointCloud::read(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+}
+
 /// Finds the scene and the first points of a capture under a configuration.
 pub fn survey(capture: &Capture, config: &Config) -> Result<(Scene, InitialPoints), ReconstructError> {
     let cameras: Vec<Camera> = capture.train.iter().map(|v| v.camera).collect();
@@ -134,7 +145,7 @@ pub fn survey(capture: &Capture, config: &Config) -> Result<(Scene, InitialPoint
         InitialSource::Uniform => None,
         InitialSource::Points | InitialSource::Auto if capture.points.is_some() => {
             let path = capture.points.as_ref().ok_or_else(|| unusable("no point cloud"))?;
-            let cloud = PointCloud::read(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })?;
+            let cloud = read_points(path)?;
             let mut points = from_cloud(cloud, config.initial_count());
             points.origin = format!("{} points of {}", points.positions.len(), path.display());
             (!points.positions.is_empty()).then_some(points)

@@ -8,7 +8,10 @@ use std::path::Path;
 /// Opens a capture as a configuration says.
 pub fn open_capture(path: &Path, config: &Config) -> Result<Capture, SssError> {
     let options = OpenOptions {
+        format: config.input.format.format(),
         transfer: config.input.transfer.transfer(),
+        exr_transfer: config.input.exr_transfer.transfer(),
+        hold_out_every: config.input.hold_out_every,
         cache_bytes: config.input.cache_bytes,
         ..OpenOptions::default()
     };

@@ -18,6 +18,7 @@ pub fn inspect_text(capture: &Capture) -> String {
 
 fn report(out: &mut String, capture: &Capture, f: &Findings) -> std::fmt::Result {
     writeln!(out, "Capture   {}", capture.root.display())?;
+    writeln!(out, "Format    {}", capture.format)?;
     if let Ok(hash) = capture.hash() {
         writeln!(out, "Hash      {hash}")?;
     }
@@ -97,7 +98,8 @@ fn report(out: &mut String, capture: &Capture, f: &Findings) -> std::fmt::Result
         writeln!(out, "  RGB is read as {reading}")?;
     }
     writeln!(out, "\nAlso there")?;
-    writeln!(out, "  point cloud     {}", if capture.points.is_some() { "points3d.ply" } else { "no" })?;
+    let name = capture.points.as_ref().map(|p| p.strip_prefix(&capture.root).unwrap_or(p).display().to_string());
+    writeln!(out, "  point cloud     {}", name.as_deref().unwrap_or("no"))?;
     let with_truth = |split| capture.views(split).iter().filter(|v| v.has_ground_truth_geometry()).count();
     let (train, test) = (with_truth(Split::Train), with_truth(Split::Test));
     writeln!(out, "  true geometry   {train} training and {test} held-out views")?;
