@@ -4,6 +4,7 @@
 mod captures;
 mod determinism;
 mod fixtures;
+mod formats;
 mod oracles;
 mod resume;
 mod tidy;
