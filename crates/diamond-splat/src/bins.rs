@@ -7,6 +7,7 @@
 //! large sort, because everything that is read then lies close together.
 use crate::ellipse::{BANDS, BLOCK, Ellipse, Prepared, band_spans, block_span};
 use crate::projection::{Outline, Splat};
+use crate::recycle::{ENTRIES, Pool};
 use diamond_simd::Simd;
 use std::ops::Range;
 
@@ -82,19 +83,25 @@ pub(crate) struct Run {
     places: Vec<(u32, u32)>,
 }
 
+static SLOTS: Pool<Slot> = Pool::new();
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        SLOTS.give(std::mem::take(&mut self.slots));
+    }
+}
+
 impl Run {
     /// Buckets the splats of one run in an image of this size, pixels.
     #[inline(always)]
     pub fn new<S: Simd>(s: S, splats: Vec<Splat>, outlines: &[Outline], size: [usize; 2]) -> Self {
         let grid = grid(size);
         let blocks = size[0].div_ceil(BLOCK) as f32;
-        let mut run = Run {
-            region_start: vec![0; grid[0] * grid[1] + 1],
-            place_start: Vec::with_capacity(splats.len() + 1),
-            places: Vec::with_capacity(3 * splats.len()),
-            ..Default::default()
-        };
-        let mut by_splat: Vec<Slot> = Vec::with_capacity(3 * splats.len());
+        let mut run = Run::default();
+        run.region_start.resize(grid[0] * grid[1] + 1, 0);
+        run.place_start.reserve(splats.len() + 1);
+        run.places.reserve(3 * splats.len());
+        let mut by_splat = SLOTS.take();
         for (splat, outline) in splats.iter().zip(outlines) {
             run.place_start.push(run.places.len() as u32);
             let mut slot = Slot {
@@ -137,10 +144,12 @@ impl Run {
             *start = total;
         }
         let nothing = Slot { ellipse: Ellipse::default(), gaussian: 0, depth: 0.0, spans: [Span::NONE; ROWS] };
-        run.slots = vec![nothing; by_splat.len()];
+        run.slots = SLOTS.take();
+        run.slots.resize(by_splat.len(), nothing);
         for (slot, &(region, place)) in by_splat.iter().zip(&run.places) {
             run.slots[(run.region_start[region as usize] + place) as usize] = *slot;
         }
+        SLOTS.give(by_splat);
         run.splats = splats;
         run
     }
@@ -391,10 +400,19 @@ pub(crate) struct Reached {
     counts: Vec<u32>,
 }
 
+impl Drop for Reached {
+    fn drop(&mut self) {
+        ENTRIES.give(std::mem::take(&mut self.entries));
+        ENTRIES.give(std::mem::take(&mut self.counts));
+    }
+}
+
 impl Reached {
-    /// With room for so many entries.
-    pub fn with_capacity(entries: usize) -> Self {
-        Self { entries: Vec::with_capacity(entries), counts: Vec::with_capacity(ROWS * COLUMNS) }
+    /// Of no block yet.
+    pub fn new() -> Self {
+        let mut counts = ENTRIES.take();
+        counts.reserve(ROWS * COLUMNS);
+        Self { entries: ENTRIES.take(), counts }
     }
 
     /// Begins the next block.

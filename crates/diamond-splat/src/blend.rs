@@ -7,6 +7,7 @@ use crate::Features;
 use crate::bins::{Bins, COLUMNS, REGION, ROWS, Reached, Scratch, grid};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Limits, Offsets, Thresholds, alphas, composite};
+use crate::recycle::FLOATS;
 use diamond_simd::{Block, Simd, WithSimd, any_positive, load_block, store_block, with_lanes};
 
 /// Entries of a block that are prepared and blended together.
@@ -146,11 +147,12 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
     }
     scratch.list();
     let scratch = &*scratch;
-    let mut lists = Reached::with_capacity(8 * scratch.slots.len());
+    let mut lists = Reached::new();
     let [corner_x, corner_y] = scene.corner(region);
     let [width, height] = scene.region_size(region);
     let channels = scene.channels;
-    let mut data = vec![0.0f32; width * height * (channels + 2)];
+    let mut data = FLOATS.take();
+    data.resize(width * height * (channels + 2), 0.0);
     let (features, rest) = data.split_at_mut(width * height * channels);
     let (opacity, depth) = rest.split_at_mut(width * height);
     let groups = scene.groups();

@@ -18,6 +18,7 @@ mod ply;
 mod projection;
 mod pullback;
 mod rasterize;
+mod recycle;
 pub mod relocation;
 mod visibility;
 mod wide;

@@ -152,11 +152,12 @@ pub fn project(gaussians: &Gaussians, camera: &Camera, config: &RasterConfig) ->
         })
         .collect();
     let mut radii = vec![0.0; n];
-    let mut visible = Vec::with_capacity(runs.iter().map(|run| run.splats.len()).sum());
-    for s in runs.iter().flat_map(|run| &run.splats) {
-        radii[s.gaussian as usize] = s.extent[0].max(s.extent[1]);
-        visible.push(s.gaussian);
-    }
+    radii.par_chunks_mut(CHUNK).zip(&runs).enumerate().for_each(|(chunk, (radii, run))| {
+        for s in &run.splats {
+            radii[s.gaussian as usize - chunk * CHUNK] = s.extent[0].max(s.extent[1]);
+        }
+    });
+    let visible = runs.par_iter().flat_map_iter(|run| run.splats.iter().map(|s| s.gaussian)).collect();
     let [width, height] = grid(view.size.map(|side| side as usize));
     let bins = Bins::new(runs, width * height);
     Ok(Projection { camera: *camera, config: *config, bins, visible, radii })

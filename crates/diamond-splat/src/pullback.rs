@@ -13,6 +13,7 @@ use crate::bins::{Reached, Scratch};
 use crate::blend::{Scene, TOGETHER};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Limits, OFFSETS, Offsets, alphas, composite};
+use crate::recycle::FLOATS;
 use diamond_simd::{Simd, WithSimd, load_block, store_block, with_lanes};
 use glam::{Mat4, Vec4};
 
@@ -103,7 +104,8 @@ fn backward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionBac
     let line = GEOMETRY + stride;
     scratch.gather(scene.bins, region, scene.features, stride);
     let scratch = &*scratch;
-    let mut grad = vec![0.0f32; scratch.slots.len() * line];
+    let mut grad = FLOATS.take();
+    grad.resize(scratch.slots.len() * line, 0.0);
     let offsets = Offsets::<S, N>::new();
     // Hidden from the compiler, which would make constants of it and four long chains of additions.
     let basis = std::hint::black_box(moment_basis());

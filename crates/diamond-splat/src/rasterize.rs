@@ -6,6 +6,7 @@ use crate::footprint::{FootprintGrad, View, finite_f32, project_pull};
 use crate::lanes::Thresholds;
 use crate::projection::{CHUNK, is_smooth, project};
 use crate::pullback::{GEOMETRY, RegionBackward};
+use crate::recycle::FLOATS;
 use crate::wide::WIDTH;
 use crate::{Features, Gaussians, GaussiansGrad, LowerFactor, Projection, RasterConfig, RasterPull, SplatError};
 use diamond_camera::Camera;
@@ -167,7 +168,11 @@ fn blend<'a>(
     raster.stats.block_entries = work.clone().map(|w| w.entries).sum();
     raster.stats.evaluated_pairs = work.clone().map(|w| w.evaluated).sum();
     raster.stats.blended_pairs = projection.config.count_blended.then(|| work.map(|w| w.blended).sum());
-    let lists = regions.into_iter().map(|region| region.lists).collect();
+    let take_lists = |region: RegionImage| {
+        FLOATS.give(region.data);
+        region.lists
+    };
+    let lists = regions.into_iter().map(take_lists).collect();
     Ok((raster, RasterPullback { gaussians, features, projection, lists, level }))
 }
 
@@ -261,7 +266,9 @@ impl RasterPullback<'_> {
                 with_scratch(|scratch| self.level.dispatch(RegionBackward { scene: &scene, region, lists, scratch, d }))
             })
             .collect();
-        Ok(self.gather(&parts))
+        let pull = self.gather(&parts);
+        parts.into_iter().for_each(|part| FLOATS.give(part));
+        Ok(pull)
     }
 
     /// Sums the regions' contributions per splat, in order of regions, and pulls them through the projection.
