@@ -43,6 +43,6 @@ pub use model::Model;
 pub use objective::TermValue;
 pub use parameters::{Activated, ActivatedGrad, Attribute, GaussianParameters, Group, Layout, logit, sigmoid};
 pub use reconstruction::Reconstruction;
-pub use scene::{InitialPoints, Scene, survey};
+pub use scene::{InitialPoints, InitialSplats, Scene, survey};
 pub use schedule::StepPlan;
 pub use tensor_file::{TensorFile, write_atomically};

@@ -73,8 +73,13 @@ impl Model {
             set(Attribute::Mean, &p.to_array());
             set(Attribute::Opacity, &[logit(config.initial.opacity)]);
             set(Attribute::Normal, &normal.to_array());
-            let thin = width * config.initial.flatness.max(1e-3);
-            parameters.set_covariance(i, Vec3::new(width, width, thin), rotation);
+            let (mut scales, mut orientation) =
+                (Vec3::new(width, width, width * config.initial.flatness.max(1e-3)), rotation);
+            if let Some(splats) = &points.splats {
+                (scales, orientation) = (splats.scales[i], splats.rotations[i]);
+                parameters.values_mut(Attribute::Opacity)[i] = splats.opacity_logits[i];
+            }
+            parameters.set_covariance(i, scales, orientation);
         }
         let network = match config.residual.network {
             true => {

@@ -5,8 +5,10 @@ use diamond_dataset::{Capture, Observation};
 use diamond_image::Mask;
 use diamond_light::{Falloff, OlatLight};
 use diamond_splat::{HullConfig, PointCloud, scene_bounds_from_masks, visual_hull};
+use diamond_splat_files::SplatFormat;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 /// Position, size and brightness of the scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -67,6 +69,19 @@ pub struct InitialPoints {
     pub normals: Vec<Vec3>,
     /// Where they came from, for the log.
     pub origin: String,
+    /// Shapes and opacities, where the file of points was one of splats.
+    pub splats: Option<InitialSplats>,
+}
+
+/// First shapes and opacities of a file of splats, one for each point.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct InitialSplats {
+    /// Standard deviations, scene units, above 0.
+    pub scales: Vec<Vec3>,
+    /// Local → world, of unit length.
+    pub rotations: Vec<glam::Quat>,
+    /// Logits of the opacity.
+    pub opacity_logits: Vec<f32>,
 }
 
 /// Half the side of the bounds over the largest distance of an initial point from their centre.
@@ -92,7 +107,46 @@ fn from_cloud(cloud: PointCloud, count: usize) -> InitialPoints {
         Some(normals) => keep.iter().map(|&i| normals[i].try_normalize().unwrap_or(Vec3::ZERO)).collect(),
         None => vec![Vec3::ZERO; keep.len()],
     };
-    InitialPoints { positions: keep.iter().map(|&i| cloud.positions[i]).collect(), normals, origin: String::new() }
+    InitialPoints { positions: keep.iter().map(|&i| cloud.positions[i]).collect(), normals, ..Default::default() }
+}
+
+/// Opacities of a file are kept this far from certain, as a logit: nothing could be learned of those beyond.
+const MAX_INITIAL_LOGIT: f32 = 4.6;
+
+/// Points of a PLY file or of a COLMAP model, or the Gaussians of a splat file of any format.
+fn from_file(path: &Path, count: usize) -> Result<InitialPoints, ReconstructError> {
+    let unusable = |detail: String| ReconstructError::Unusable { detail };
+    if path.extension().is_some_and(|e| e == "bin" || e == "txt") {
+        let points = diamond_dataset::read_colmap_points(path)?;
+        let colour = |rgb: &[u8; 3]| Vec3::from(rgb.map(|v| f32::from(v) / 255.0));
+        let colors = Some(points.colours.iter().map(colour).collect());
+        return Ok(from_cloud(PointCloud { positions: points.positions, normals: None, colors }, count));
+    }
+    let bytes = std::fs::read(path).map_err(|source| ReconstructError::Io {
+        path: path.to_owned(),
+        action: "read the initial points",
+        source,
+    })?;
+    if bytes.starts_with(b"ply") && !SplatFormat::is_splat_ply(&bytes) {
+        let cloud = PointCloud::read(path).map_err(|e| unusable(e.to_string()))?;
+        return Ok(from_cloud(cloud, count));
+    }
+    drop(bytes);
+    let cloud = diamond_splat_files::read(path).map_err(|e| unusable(e.to_string()))?.cloud;
+    let n = cloud.len();
+    // As for points: an even subset in file order.
+    let keep: Vec<usize> = if n <= count { (0..n).collect() } else { (0..count).map(|i| i * n / count).collect() };
+    let points = PointCloud { positions: cloud.means.clone(), normals: cloud.normals.clone(), colors: None };
+    let gaussians = cloud.to_gaussians();
+    let splats = InitialSplats {
+        scales: keep.iter().map(|&i| gaussians.scales[i]).collect(),
+        rotations: keep.iter().map(|&i| gaussians.rotations[i]).collect(),
+        opacity_logits: keep
+            .iter()
+            .map(|&i| cloud.opacity_logits[i].clamp(-MAX_INITIAL_LOGIT, MAX_INITIAL_LOGIT))
+            .collect(),
+    };
+    Ok(InitialPoints { splats: Some(splats), ..from_cloud(points, count) })
 }
 
 fn from_hull(capture: &Capture, config: &Config) -> Result<Option<InitialPoints>, ReconstructError> {
@@ -121,18 +175,7 @@ fn uniform(centre: Vec3, radius: f32, config: &Config) -> InitialPoints {
     let positions: Vec<Vec3> =
         (0..config.initial_count()).map(|_| centre + radius * Vec3::new(draw(), draw(), draw())).collect();
     let normals = positions.iter().map(|p| (*p - centre).try_normalize().unwrap_or(Vec3::Z)).collect();
-    InitialPoints { positions, normals, origin: "uniform in the bounds".into() }
-}
-
-/// The point cloud of a capture: a PLY file, or the points of a COLMAP model.
-fn read_points(path: &std::path::Path) -> Result<PointCloud, ReconstructError> {
-    if path.extension().is_some_and(|e| e == "bin" || e == "txt") {
-        let points = diamond_dataset::read_colmap_points(path)?;
-        let colour = |rgb: &[u8; 3]| Vec3::from(rgb.map(|v| f32::from(v) / 255.0));
-        let colors = Some(points.colours.iter().map(colour).collect());
-        return Ok(PointCloud { positions: points.positions, normals: None, colors });
-    }
-    PointCloud::read(path).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+    InitialPoints { positions, normals, origin: "uniform in the bounds".into(), splats: None }
 }
 
 /// Finds the scene and the first points of a capture under a configuration.
@@ -145,9 +188,9 @@ pub fn survey(capture: &Capture, config: &Config) -> Result<(Scene, InitialPoint
         InitialSource::Uniform => None,
         InitialSource::Points | InitialSource::Auto if capture.points.is_some() => {
             let path = capture.points.as_ref().ok_or_else(|| unusable("no point cloud"))?;
-            let cloud = read_points(path)?;
-            let mut points = from_cloud(cloud, config.initial_count());
-            points.origin = format!("{} points of {}", points.positions.len(), path.display());
+            let mut points = from_file(path, config.initial_count())?;
+            let kind = if points.splats.is_some() { "Gaussians" } else { "points" };
+            points.origin = format!("{} {kind} of {}", points.positions.len(), path.display());
             (!points.positions.is_empty()).then_some(points)
         }
         InitialSource::Points => {

@@ -30,7 +30,8 @@ pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
 pub use hull::{Hull, HullConfig, scene_bounds_from_masks, visual_hull};
 pub use neighbours::mean_squared_distance_to_nearest;
 pub use ply::{
-    PlyColumn, PlyFormat, PlyTable, PointCloud, SH_DC, ScalarType, SplatPly, parse_ply, ply_bytes, read_ply, write_ply,
+    Keep, PlyColumn, PlyElementLayout, PlyFormat, PlyLayout, PlyPropertyLayout, PlyTable, PointCloud, SH_DC,
+    ScalarType, SplatPly, parse_ply, parse_ply_columns, ply_bytes, ply_layout, read_ply, replace_file, write_ply,
 };
 pub use projection::{Footprint, Projection, project};
 pub use rasterize::{Raster, RasterGrad, RasterPullback, RasterStats, rasterize, rasterize_projected};

@@ -10,14 +10,16 @@
 //! satisfy, and every complaint names the file, the line or byte, and what to do.
 mod body;
 mod header;
+mod layout;
 mod point_cloud;
 mod splat;
 mod write;
 
 pub use header::{PlyFormat, ScalarType};
+pub use layout::{PlyElementLayout, PlyLayout, PlyPropertyLayout, ply_layout};
 pub use point_cloud::PointCloud;
 pub use splat::{SH_DC, SplatPly};
-pub use write::{ply_bytes, write_ply};
+pub use write::{ply_bytes, replace_file, write_ply};
 
 use crate::SplatError;
 use std::path::{Path, PathBuf};
@@ -137,13 +139,29 @@ impl PlyTable {
     }
 }
 
+/// What a reader wants with a property.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Keep {
+    /// Nothing: its values are walked over, whatever they are.
+    No,
+    /// Its values; one that is NaN or infinite in 32 bits is an error.
+    Finite,
+    /// Its values, infinities among them; a NaN is an error.
+    Infinite,
+}
+
+/// [`parse_ply`] of some properties only: `keep` is asked once for each by its name.
+pub fn parse_ply_columns(bytes: &[u8], keep: &dyn Fn(&str) -> Keep) -> Result<PlyTable, SplatError> {
+    let header = header::parse(bytes)?;
+    body::parse(bytes, &header, keep)
+}
+
 /// Reads the `vertex` element from the bytes of a PLY file.
 ///
 /// Elements that precede it are skipped, those after it and any trailing bytes are not looked at. List properties
 /// are skipped. A value that is not finite is an error.
 pub fn parse_ply(bytes: &[u8]) -> Result<PlyTable, SplatError> {
-    let header = header::parse(bytes)?;
-    body::parse(bytes, &header)
+    parse_ply_columns(bytes, &|_| Keep::Finite)
 }
 
 /// [`parse_ply`] of a file.

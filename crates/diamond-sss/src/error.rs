@@ -2,6 +2,7 @@
 use diamond_dataset::DatasetError;
 use diamond_metrics::MetricError;
 use diamond_reconstruct::ReconstructError;
+use diamond_splat_files::SplatFileError;
 use std::path::{Path, PathBuf};
 
 /// Errors of this crate.
@@ -20,6 +21,8 @@ pub enum SssError {
         /// What was expected, what was found, what to do.
         detail: String,
     },
+    /// A splat file is at fault.
+    Splats(SplatFileError),
     /// A file could not be read or written.
     Io {
         /// The file.
@@ -53,7 +56,8 @@ impl SssError {
             Self::Reconstruct(ReconstructError::Capture(DatasetError::Selection { .. })) => 2,
             Self::Capture(DatasetError::Write { .. })
             | Self::Reconstruct(ReconstructError::Capture(DatasetError::Write { .. })) => 1,
-            Self::Capture(_) | Self::Input { .. } => 3,
+            Self::Splats(SplatFileError::Io { action, source, .. }) => reading(action, source),
+            Self::Capture(_) | Self::Input { .. } | Self::Splats(_) => 3,
             Self::Reconstruct(e) => match e {
                 ReconstructError::Config { .. }
                 | ReconstructError::Capture(_)
@@ -89,6 +93,7 @@ impl std::fmt::Display for SssError {
             Self::Usage(detail) | Self::Internal(detail) => write!(f, "{detail}"),
             Self::Capture(e) => write!(f, "{e}"),
             Self::Reconstruct(e) => write!(f, "{e}"),
+            Self::Splats(e) => write!(f, "{e}"),
             Self::Metric(e) => write!(f, "evaluation: {e}"),
             Self::Input { path, detail } => write!(f, "{}: {detail}", path.display()),
             Self::Io { path, action, source } => {
@@ -122,6 +127,7 @@ impl std::error::Error for SssError {
         match self {
             Self::Capture(e) => Some(e),
             Self::Reconstruct(e) => Some(e),
+            Self::Splats(e) => Some(e),
             Self::Metric(e) => Some(e),
             Self::Io { source, .. } => Some(source),
             _ => None,
@@ -132,6 +138,12 @@ impl std::error::Error for SssError {
 impl From<DatasetError> for SssError {
     fn from(e: DatasetError) -> Self {
         Self::Capture(e)
+    }
+}
+
+impl From<SplatFileError> for SssError {
+    fn from(e: SplatFileError) -> Self {
+        Self::Splats(e)
     }
 }
 

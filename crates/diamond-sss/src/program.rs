@@ -9,6 +9,7 @@ use diamond_reconstruct::{Config, InstructionChoice, PRESETS};
 use diamond_sss::{CameraChoice, LightChoice, RenderOptions, SssError};
 use progress::Counter;
 use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// Runs the program.
@@ -58,6 +59,9 @@ fn run(command: Command) -> Result<(), SssError> {
             written.iter().for_each(|path| print(&format!("{}\n", path.display())));
             Ok(())
         }
+        Command::Inspect { capture, output } if diamond_sss::is_splat_file(&capture) => {
+            inspect_splats(&capture, output)
+        }
         Command::Inspect { capture, output } => {
             let capture = diamond_dataset::Capture::open(&capture, &Default::default())?;
             print(&diamond_sss::inspect_text(&capture));
@@ -70,9 +74,14 @@ fn run(command: Command) -> Result<(), SssError> {
             }
             Ok(())
         }
-        Command::Export { dir, output, materials } => {
-            let count = diamond_sss::export_model(&dir, &output, materials)?;
-            print(&format!("written: {} ({count} Gaussians)\n", output.display()));
+        Command::Export { dir, output, materials, writing } => {
+            let exported = diamond_sss::export_model(&dir, &output, &writing.options(materials))?;
+            report_export(&output, &exported);
+            Ok(())
+        }
+        Command::Convert { input, output, writing } => {
+            let exported = diamond_sss::convert_splats(&input, &output, &writing.options(false))?;
+            report_export(&output, &exported);
             Ok(())
         }
         Command::Presets { name } => {
@@ -87,6 +96,22 @@ fn run(command: Command) -> Result<(), SssError> {
 
 fn choose_instructions(choice: Option<InstructionChoice>) -> Result<(), SssError> {
     choice.unwrap_or_default().apply().map(drop).map_err(|e| SssError::Usage(e.to_string()))
+}
+
+fn inspect_splats(path: &Path, output: Option<PathBuf>) -> Result<(), SssError> {
+    let file = diamond_splat_files::read(path)?;
+    print(&diamond_sss::inspect_splats(path, &file));
+    if let Some(path) = output {
+        let (width, height, rgb) = diamond_sss::splat_picture(&file.cloud)?;
+        diamond_sss::write_output(&path, &diamond_sss::encode_png_rgb(&rgb, width, height)?)?;
+        print(&format!("written: {}\n", path.display()));
+    }
+    Ok(())
+}
+
+fn report_export(output: &Path, exported: &diamond_sss::Exported) {
+    exported.notes.iter().for_each(|note| print(&format!("note: {note}\n")));
+    print(&format!("written: {} ({} Gaussians)\n", output.display(), exported.count));
 }
 
 fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {

@@ -6,7 +6,7 @@ use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
 use crate::{Metrics, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
 use diamond_dataset::{Capture, Selection};
-use diamond_reconstruct::{Config, InstructionChoice, Reconstruction, StepReport};
+use diamond_reconstruct::{Config, InitialSource, InstructionChoice, Reconstruction, StepReport};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,6 +33,8 @@ pub struct ReconstructOptions {
     pub views: Selection,
     /// Training lights.
     pub lights: Selection,
+    /// Points (PLY) or splats (any format) to start from, in place of the capture's.
+    pub initial: Option<PathBuf>,
     /// Continue from the checkpoint.
     pub resume: bool,
     /// Replace the results of an earlier run.
@@ -54,6 +56,7 @@ impl ReconstructOptions {
             instruction_set: None,
             views: Selection::All,
             lights: Selection::All,
+            initial: None,
             resume: false,
             force: false,
             command: String::new(),
@@ -66,6 +69,9 @@ impl ReconstructOptions {
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
         config.instruction_set = self.instruction_set.unwrap_or(config.instruction_set);
+        if self.initial.is_some() {
+            config.initial.source = InitialSource::Points;
+        }
         config.validate(&self.preset)?;
         Ok(config)
     }
@@ -192,7 +198,10 @@ fn run(
     let whole = open_capture(&options.capture, &config)?;
     whole.notes.iter().for_each(|note| events(Event::Note(note.clone())));
     check_images(&whole)?;
-    let capture = whole.select(&options.views, &options.lights)?;
+    let mut capture = whole.select(&options.views, &options.lights)?;
+    if let Some(path) = &options.initial {
+        capture.points = Some(path.clone());
+    }
     let capture_hash = whole.hash()?;
     std::fs::create_dir_all(folder).map_err(SssError::io(folder, "create the folder"))?;
     if options.force {

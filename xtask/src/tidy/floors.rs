@@ -63,6 +63,7 @@ pub const PACKAGES: &[Package] = &[
     Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(&[]) },
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2"]),
     light("diamond-losses", 2, &[]),
+    heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd"]),
     heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2"]),
     heavy(
         "diamond-sss",

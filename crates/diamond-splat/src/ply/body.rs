@@ -1,13 +1,13 @@
 //! The values of a PLY file, text or binary.
 use super::header::{Element, Header, PlyFormat, ScalarType, Shape, quoted};
-use super::{Place, PlyColumn, PlyTable, malformed};
+use super::{Keep, Place, PlyColumn, PlyTable, malformed};
 use crate::SplatError;
 
 const TRUNCATED: &str = "the file is truncated or its header is wrong: copy or export it again";
 const REPAIR: &str = "repair the file or export it again";
 
-/// Reads the vertex element that `header` announces.
-pub(super) fn parse(bytes: &[u8], header: &Header) -> Result<PlyTable, SplatError> {
+/// Reads those columns of the vertex element that `header` announces which `keep` wants.
+pub(super) fn parse(bytes: &[u8], header: &Header, keep: &dyn Fn(&str) -> Keep) -> Result<PlyTable, SplatError> {
     let vertex = &header.elements[header.vertex];
     if vertex.count > 0 && !vertex.properties.iter().any(|p| matches!(p.shape, Shape::Scalar(_))) {
         return Err(malformed(
@@ -22,7 +22,7 @@ pub(super) fn parse(bytes: &[u8], header: &Header) -> Result<PlyTable, SplatErro
             for element in &header.elements[..header.vertex] {
                 text.skip(element)?;
             }
-            text.columns(vertex)?
+            text.columns(vertex, keep)?
         }
         PlyFormat::BinaryLittleEndian | PlyFormat::BinaryBigEndian => {
             let big = header.format == PlyFormat::BinaryBigEndian;
@@ -30,24 +30,39 @@ pub(super) fn parse(bytes: &[u8], header: &Header) -> Result<PlyTable, SplatErro
             for element in &header.elements[..header.vertex] {
                 binary.skip(element)?;
             }
-            binary.columns(vertex)?
+            binary.columns(vertex, keep)?
         }
     };
     Ok(PlyTable { comments: header.comments.clone(), columns, len: vertex.count })
 }
 
 /// Columns with room for every vertex. Call only once it is known that the bytes can hold that many.
-fn empty_columns(vertex: &Element) -> Vec<PlyColumn> {
+fn empty_columns(vertex: &Element, kept: &[Keep]) -> Vec<PlyColumn> {
     vertex
         .properties
         .iter()
-        .filter_map(|p| match p.shape {
-            Shape::Scalar(scalar) => {
+        .zip(kept)
+        .filter_map(|(p, keep)| match p.shape {
+            Shape::Scalar(scalar) if *keep != Keep::No => {
                 Some(PlyColumn { name: p.name.clone(), scalar, values: Vec::with_capacity(vertex.count) })
             }
-            Shape::List { .. } => None,
+            _ => None,
         })
         .collect()
+}
+
+/// What `keep` says of each property.
+fn kept(vertex: &Element, keep: &dyn Fn(&str) -> Keep) -> Vec<Keep> {
+    vertex.properties.iter().map(|p| keep(&p.name)).collect()
+}
+
+/// Whether a value must be refused.
+fn refused(value: f64, keep: Keep) -> bool {
+    match keep {
+        Keep::Finite => !(value as f32).is_finite(),
+        Keep::Infinite => value.is_nan(),
+        Keep::No => false,
+    }
 }
 
 fn not_finite(place: Place, name: &str, vertex: usize, value: f64) -> SplatError {
@@ -137,13 +152,14 @@ impl Binary<'_> {
         Ok(())
     }
 
-    fn columns(&mut self, vertex: &Element) -> Result<Vec<PlyColumn>, SplatError> {
+    fn columns(&mut self, vertex: &Element, keep: &dyn Fn(&str) -> Keep) -> Result<Vec<PlyColumn>, SplatError> {
         let smallest = vertex.properties.iter().map(|p| p.min_size()).sum();
         self.check(vertex, vertex.count, smallest)?;
-        let mut columns = empty_columns(vertex);
+        let kept = kept(vertex, keep);
+        let mut columns = empty_columns(vertex, &kept);
         for row in 0..vertex.count {
             let mut column = 0;
-            for property in &vertex.properties {
+            for (property, &keep) in vertex.properties.iter().zip(&kept) {
                 match property.shape {
                     Shape::List { count, item } => self.skip_list(vertex, count, item)?,
                     Shape::Scalar(scalar) => {
@@ -155,11 +171,13 @@ impl Binary<'_> {
                                 TRUNCATED,
                             ));
                         };
-                        if !(value as f32).is_finite() {
+                        if refused(value, keep) {
                             return Err(not_finite(Place::Byte(start), &property.name, row, value));
                         }
-                        columns[column].values.push(value as f32);
-                        column += 1;
+                        if keep != Keep::No {
+                            columns[column].values.push(value as f32);
+                            column += 1;
+                        }
                     }
                 }
             }
@@ -209,7 +227,7 @@ impl<'a> Text<'a> {
         Ok(())
     }
 
-    fn columns(&mut self, vertex: &Element) -> Result<Vec<PlyColumn>, SplatError> {
+    fn columns(&mut self, vertex: &Element, keep: &dyn Fn(&str) -> Keep) -> Result<Vec<PlyColumn>, SplatError> {
         // Each value takes a digit and a separator, but for the last.
         let left = self.bytes.len() - self.at;
         let least = vertex.count.checked_mul(vertex.properties.len()).and_then(|n| n.checked_mul(2));
@@ -224,7 +242,8 @@ impl<'a> Text<'a> {
                 TRUNCATED,
             ));
         }
-        let mut columns = empty_columns(vertex);
+        let kept = kept(vertex, keep);
+        let mut columns = empty_columns(vertex, &kept);
         for row in 0..vertex.count {
             let line = self.line(vertex, row)?;
             let place = self.place;
@@ -239,15 +258,17 @@ impl<'a> Text<'a> {
                 })
             };
             let mut column = 0;
-            for property in &vertex.properties {
+            for (property, &keep) in vertex.properties.iter().zip(&kept) {
                 match property.shape {
                     Shape::Scalar(scalar) => {
                         let value = text_scalar(next(&property.name)?, scalar, place)?;
-                        if !(value as f32).is_finite() {
+                        if refused(value, keep) {
                             return Err(not_finite(place, &property.name, row, value));
                         }
-                        columns[column].values.push(value as f32);
-                        column += 1;
+                        if keep != Keep::No {
+                            columns[column].values.push(value as f32);
+                            column += 1;
+                        }
                     }
                     Shape::List { count, item } => {
                         let length = text_scalar(next(&property.name)?, count, place)?;

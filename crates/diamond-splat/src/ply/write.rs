@@ -108,8 +108,7 @@ fn check(table: &PlyTable) -> Result<(), SplatError> {
 
 /// Writes `table` as a `binary_little_endian` PLY file.
 ///
-/// The bytes go to a temporary file beside `path`, are synchronised to the disk and renamed into place: whoever
-/// reads `path` sees the old file or the new one, also after a crash.
+/// Whoever reads `path` sees the old file or the new one, also after a crash ([`replace_file`]).
 pub fn write_ply(path: impl AsRef<Path>, table: &PlyTable) -> Result<(), SplatError> {
     let path = path.as_ref();
     let bytes = ply_bytes(table, PlyFormat::BinaryLittleEndian).map_err(|e| in_file(e, path))?;
@@ -119,7 +118,9 @@ pub fn write_ply(path: impl AsRef<Path>, table: &PlyTable) -> Result<(), SplatEr
 /// Makes the temporary names of one process distinct.
 static TEMPORARY: AtomicU64 = AtomicU64::new(0);
 
-fn replace_file(path: &Path, bytes: &[u8]) -> Result<(), SplatError> {
+/// Writes `bytes` to `path` whole or not at all: a temporary file beside it, synchronised to the disk, renamed into
+/// place. What was there before stays until then.
+pub fn replace_file(path: &Path, bytes: &[u8]) -> Result<(), SplatError> {
     let Some(name) = path.file_name() else {
         return Err(refused(path, "cannot be written; name a file", std::io::ErrorKind::InvalidInput.into()));
     };

@@ -2,6 +2,8 @@
 use clap::{Args, Parser, Subcommand};
 use diamond_dataset::Selection;
 use diamond_reconstruct::InstructionChoice;
+use diamond_splat_files::{SplatFormat, WriteOptions};
+use diamond_sss::ExportOptions;
 use std::path::PathBuf;
 
 /// Reconstructs translucent objects from photographs under one light at a time, and shows them under any light.
@@ -39,28 +41,47 @@ pub enum Command {
     },
     /// Render a model: any camera path, any light or mix of lights
     Render(RenderArguments),
-    /// Say what is in a capture: cameras, lights, coverage, exposure, what is missing
-    #[command(after_help = "Examples:\n  diamond inspect capture\n  diamond inspect capture -o overview.png")]
+    /// Say what is in a capture (cameras, lights, coverage, exposure, what is missing) or in a splat file
+    #[command(after_help = "Examples:\n  diamond inspect capture\n  diamond inspect capture -o overview.png\n  \
+diamond inspect bunny.spz -o bunny.png")]
     Inspect {
-        /// The capture
+        /// The capture, or a splat file: .ply, .compressed.ply, .splat, .spz, .glb, .gltf
         capture: PathBuf,
         /// Also draw a picture (PNG)
         #[arg(short, long)]
         output: Option<PathBuf>,
     },
-    /// Write the Gaussians for other programs
+    /// Write the Gaussians of a model for other programs
     #[command(
-        after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials"
+        after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials\n  \
+diamond export out -o splats.spz --turn x:180\n  diamond export out -o splats.glb\n\nColour is the base colour: linear, \
+without light, the same from everywhere. What a format\ncannot hold is printed."
     )]
     Export {
         /// Folder of a finished reconstruction
         dir: PathBuf,
-        /// The PLY file to write
+        /// The file to write: .ply, .splat, .spz, .glb or .gltf
         #[arg(short, long)]
         output: PathBuf,
-        /// Add base colour, roughness, metalness and subsurfaceness
+        /// Add base colour, roughness, metalness and subsurfaceness (PLY)
         #[arg(long)]
         materials: bool,
+        #[command(flatten)]
+        writing: WritingArguments,
+    },
+    /// Read a splat file of any format and write it as another
+    #[command(
+        after_help = "Examples:\n  diamond convert bunny.compressed.ply bunny.ply\n  diamond convert bunny.ply bunny.glb \
+--turn x:180\n  diamond convert bunny.ply bunny.spz --spz-version 4\n\nCoordinates are kept as they are unless --turn \
+says otherwise. PLY customarily has y down,\nSPZ and glTF have y up: --turn x:180 (or z:180) goes from one to the other."
+    )]
+    Convert {
+        /// The file to read: .ply, .compressed.ply, .splat, .spz, .glb or .gltf
+        input: PathBuf,
+        /// The file to write: .ply, .splat, .spz, .glb or .gltf
+        output: PathBuf,
+        #[command(flatten)]
+        writing: WritingArguments,
     },
     /// List the presets, or print one as TOML to start a configuration from
     #[command(after_help = "Examples:\n  diamond presets\n  diamond presets resolved > mine.toml")]
@@ -70,12 +91,43 @@ pub enum Command {
     },
 }
 
+/// Options of what writes splats.
+#[derive(Debug, Args)]
+pub struct WritingArguments {
+    /// ply, splat, spz, glb or gltf [default: what the file's name says]
+    #[arg(long, value_parser = splat_format)]
+    pub format: Option<SplatFormat>,
+    /// Turn the cloud about an axis first: AXIS:DEGREES[,AXIS:DEGREES…]
+    #[arg(long, value_parser = diamond_sss::parse_turn)]
+    pub turn: Option<glam::DAffine3>,
+    /// Version of SPZ: 3 is read by most programs, 4 by the newest
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(3..=4))]
+    pub spz_version: u32,
+}
+
+impl WritingArguments {
+    /// As the library takes them.
+    pub fn options(&self, materials: bool) -> ExportOptions {
+        ExportOptions {
+            format: self.format,
+            materials,
+            turn: self.turn.unwrap_or(glam::DAffine3::IDENTITY),
+            write: WriteOptions { spz_version: self.spz_version },
+        }
+    }
+}
+
+fn splat_format(text: &str) -> Result<SplatFormat, String> {
+    SplatFormat::from_name(text).ok_or_else(|| "expected ply, splat, spz, glb or gltf".into())
+}
+
 /// Options of `reconstruct`.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   diamond reconstruct capture -o out
   diamond reconstruct capture -o out --views 3 --lights 3 --steps 3000
   diamond reconstruct capture -o out --preset mine.toml --seed 7
+  diamond reconstruct capture -o out --initial splats.ply
   diamond reconstruct capture -o out --resume")]
 pub struct ReconstructArguments {
     /// The capture: a folder with transforms_train.json
@@ -104,6 +156,9 @@ pub struct ReconstructArguments {
     /// Training lights: a count, or indices such as 0,5,7 or 0-7
     #[arg(long, default_value = "all")]
     pub lights: Selection,
+    /// Start from this point cloud (.ply) or these splats (.ply, .splat, .spz, .glb) instead of the capture's
+    #[arg(long)]
+    pub initial: Option<PathBuf>,
     /// Continue an interrupted run, with the same options
     #[arg(long, conflicts_with = "force")]
     pub resume: bool,

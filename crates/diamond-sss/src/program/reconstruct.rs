@@ -30,6 +30,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         instruction_set: a.instruction_set,
         views: a.views,
         lights: a.lights,
+        initial: a.initial,
         resume: a.resume,
         force: a.force,
         command: std::env::args().collect::<Vec<_>>().join(" "),

@@ -89,6 +89,23 @@ fn from_capture_to_report_and_pictures() {
     assert_eq!(too_many.status.code(), Some(2));
     succeed(&["export", text(&out), "-o", text(&dir.join("x.ply")), "--materials"]);
     assert!(std::fs::read(dir.join("x.ply")).unwrap().starts_with(b"ply\n"));
+    for name in ["x.splat", "x.spz", "x.glb", "x.gltf"] {
+        let printed = succeed(&["export", text(&out), "-o", text(&dir.join(name)), "--turn", "x:180"]);
+        let printed = String::from_utf8_lossy(&printed.stdout).into_owned();
+        assert!(printed.contains("no light baked in") && printed.contains("not in the file: materials"), "{printed}");
+    }
+    assert_eq!(diamond(&["export", text(&out), "-o", text(&dir.join("x.glb")), "--materials"]).status.code(), Some(2));
+    assert_eq!(diamond(&["export", text(&out), "-o", text(&dir.join("x.obj"))]).status.code(), Some(2));
+    succeed(&["convert", text(&dir.join("x.glb")), text(&dir.join("y.ply"))]);
+    let printed = succeed(&["inspect", text(&dir.join("y.ply")), "-o", text(&dir.join("y.png"))]);
+    assert!(String::from_utf8_lossy(&printed.stdout).contains("colour of degree 0, linear"));
+    assert_eq!(image::image_dimensions(dir.join("y.png")).unwrap(), (1200, 400));
+    std::fs::write(dir.join("broken.spz"), b"NGSP").unwrap();
+    assert_eq!(diamond(&["inspect", text(&dir.join("broken.spz"))]).status.code(), Some(3));
+    let again = dir.join("again");
+    let words = ["reconstruct", text(&capture), "-o", text(&again), "--preset", text(&config), "--steps", "2"];
+    let printed = succeed(&[&words[..], &["--initial", text(&dir.join("x.glb"))]].concat());
+    assert!(String::from_utf8_lossy(&printed.stderr).contains("Gaussians of "), "{printed:?}");
     succeed(&["inspect", text(&capture), "-o", text(&dir.join("overview.png"))]);
     succeed(&["presets", "paper"]);
     assert_eq!(diamond(&["presets", "no-such"]).status.code(), Some(3));
