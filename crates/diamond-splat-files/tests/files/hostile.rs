@@ -1,7 +1,5 @@
 //! Broken files: never a panic, never more memory than stated, and texts that say what to do.
-mod clouds;
-
-use clouds::sample;
+use crate::clouds::sample;
 use diamond_splat_files::{SplatFormat, WriteOptions, limits, parse, read, to_bytes};
 use proptest::prelude::*;
 use std::alloc::{GlobalAlloc, Layout, System};

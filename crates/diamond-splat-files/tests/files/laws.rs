@@ -1,8 +1,6 @@
 //! Laws: what is written is read back, exactly where the format is float, within a step where it is not; moving a cloud
 //! moves what is seen.
-mod clouds;
-
-use clouds::{angle, cloud};
+use crate::clouds::{angle, cloud};
 use diamond_splat_files::{ColorSpace, SplatCloud, SplatFormat, WriteOptions, parse, rotate_harmonics, to_bytes};
 use glam::{DAffine3, DMat3, DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -137,7 +135,7 @@ proptest! {
 
 #[test]
 fn a_half_turn_twice_is_nothing() {
-    let cloud = clouds::sample(20, 3);
+    let cloud = crate::clouds::sample(20, 3);
     let mut turned = cloud.clone();
     let half = DAffine3::from_quat(DQuat::from_rotation_x(std::f64::consts::PI));
     assert_eq!(turned.transform(half), None);
@@ -149,7 +147,7 @@ fn a_half_turn_twice_is_nothing() {
 
 #[test]
 fn the_comparison_notices_a_difference() {
-    let cloud = clouds::sample(3, 1);
+    let cloud = crate::clouds::sample(3, 1);
     let mut other = cloud.clone();
     other.rotations[1] = other.rotations[1] * Quat::from_rotation_x(0.01);
     other.sh[4] += 0.1;
@@ -162,7 +160,7 @@ fn the_comparison_notices_a_difference() {
 
 #[test]
 fn what_is_lost_is_said() {
-    let mut cloud = clouds::sample(4, 2);
+    let mut cloud = crate::clouds::sample(4, 2);
     cloud.color_space = ColorSpace::Linear;
     cloud.normals = Some(vec![Vec3::Z; 4]);
     cloud.sh[3] = 1.7;
