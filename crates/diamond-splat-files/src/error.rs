@@ -12,11 +12,11 @@ pub enum SplatFileError {
         /// Name of the format.
         format: &'static str,
         /// Which part.
-        field: String,
+        field: Box<str>,
         /// What should be there.
-        expected: String,
+        expected: Box<str>,
         /// What is there.
-        found: String,
+        found: Box<str>,
         /// What to do.
         advice: &'static str,
     },
@@ -59,9 +59,9 @@ pub(crate) fn malformed(
     SplatFileError::Malformed {
         path: PathBuf::new(),
         format,
-        field: field.into(),
-        expected: expected.into(),
-        found: found.into(),
+        field: field.into().into_boxed_str(),
+        expected: expected.into().into_boxed_str(),
+        found: found.into().into_boxed_str(),
         advice,
     }
 }
