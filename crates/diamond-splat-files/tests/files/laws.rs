@@ -149,7 +149,7 @@ fn a_half_turn_twice_is_nothing() {
 fn the_comparison_notices_a_difference() {
     let cloud = crate::clouds::sample(3, 1);
     let mut other = cloud.clone();
-    other.rotations[1] = other.rotations[1] * Quat::from_rotation_x(0.01);
+    other.rotations[1] *= Quat::from_rotation_x(0.01);
     other.sh[4] += 0.1;
     let d = differences(&cloud, &other);
     assert!(
