@@ -105,9 +105,9 @@ pub fn parse_turn(text: &str) -> Result<DAffine3, String> {
     })
 }
 
-/// Whether `path` is a splat file rather than a capture: a file that says so by its first bytes or its name.
+/// Whether `path` is a splat file rather than a capture, by its name.
 pub fn is_splat_file(path: &Path) -> bool {
-    path.is_file() && !path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"))
+    path.is_file() && SplatFormat::from_path(path).is_ok()
 }
 
 #[cfg(test)]
