@@ -7,4 +7,5 @@ mod fixtures;
 mod formats;
 mod oracles;
 mod resume;
+mod standalone;
 mod tidy;

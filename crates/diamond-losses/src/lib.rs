@@ -27,6 +27,8 @@
 //! # Ok::<(), diamond_losses::LossError>(())
 //! ```
 mod average;
+mod compare;
+mod encode;
 mod enhancement;
 mod error;
 mod normal;
@@ -37,6 +39,7 @@ mod terms;
 mod visibility;
 
 pub use average::Average;
+pub use encode::encode_image;
 pub use enhancement::{enhanced, enhancement};
 pub use error::LossError;
 pub use normal::{AlignmentLoss, NormalLoss, flatness, normal_alignment, normal_consistency};

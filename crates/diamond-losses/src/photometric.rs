@@ -3,8 +3,11 @@ use diamond_image::{Image, Transfer};
 use diamond_metrics::{SsimWindow, ssim_mean_and_grad};
 
 use crate::LossError;
-use crate::average::{finite, subgradient};
+use crate::average::finite;
+use crate::compare::Compare;
+use crate::encode::encode_image;
 use crate::error::expect_finite;
+use diamond_simd::Level;
 
 /// How rendered image and photograph are compared.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,6 +40,9 @@ pub struct PhotometricLoss {
     pub dssim: f32,
     /// Mean squared difference, unweighted.
     pub l2: f32,
+    /// Mean squared difference in sRGB with both sides cut to [0, 1], which the PSNR of the displayed picture is made of;
+    /// a by-product, `None` where images are compared with γ 2.2.
+    pub display_error: Option<f32>,
     /// Gradient of `value` with respect to the rendered image (its shape, in linear RGB).
     pub grad: Image,
 }
@@ -57,8 +63,8 @@ pub fn photometric(
     photometric_with(rendered, target, false, options, weight)
 }
 
-/// [`photometric`] with a photograph that is already encoded in `options.space`, as a file stores it: saves encoding it
-/// anew at every step.
+/// [`photometric`] with a photograph that is already encoded in `options.space`, by [`encode_image`] or as a file stores it: saves
+/// encoding it anew at every step.
 pub fn photometric_encoded(
     rendered: &Image,
     encoded_target: &Image,
@@ -94,34 +100,25 @@ fn photometric_with(
     }
     let space = options.space;
     if space == Transfer::Linear {
-        return compare(rendered, target, options, weight);
+        return compared(rendered, rendered, target, options, weight);
     }
-    let seen = space.encode_image(rendered);
-    let mut loss = if encoded {
-        compare(&seen, target, options, weight)
+    let seen = encode_image(space, rendered);
+    if encoded {
+        compared(rendered, &seen, target, options, weight)
     } else {
-        compare(&seen, &space.encode_image(target), options, weight)
-    }?;
-    for ((g, &linear), &stored) in loss.grad.data_mut().iter_mut().zip(rendered.data()).zip(seen.data()) {
-        *g = encode_pull(space, linear, stored, *g);
-    }
-    Ok(loss)
-}
-
-/// [`Transfer::encode_pull`] where the stored value is known as well, which saves a power: for a power law with exponent
-/// 1/γ the slope is (stored + offset)/(γ·linear).
-fn encode_pull(space: Transfer, linear: f32, stored: f32, d_stored: f32) -> f32 {
-    // Below, sRGB is straight, and γ 2.2 so steep that its slope is guarded.
-    const POWER_LAW: f32 = 0.004;
-    let v = linear.abs();
-    match space {
-        Transfer::Srgb if v > POWER_LAW => d_stored * ((stored.abs() + 0.055) / v / 2.4),
-        Transfer::Gamma22 if v > POWER_LAW => d_stored * (stored.abs() / v / 2.2),
-        _ => space.encode_pull(linear, d_stored),
+        compared(rendered, &seen, &encode_image(space, target), options, weight)
     }
 }
 
-fn compare(a: &Image, b: &Image, options: &PhotometricOptions, weight: f32) -> Result<PhotometricLoss, LossError> {
+/// The loss of `linear`, which is `a` encoded, against the encoded `b`: SSIM in one fused pass, and everything else in
+/// another.
+fn compared(
+    linear: &Image,
+    a: &Image,
+    b: &Image,
+    options: &PhotometricOptions,
+    weight: f32,
+) -> Result<PhotometricLoss, LossError> {
     let (width, height, channels) = a.shape();
     let scale = 1.0 / a.data().len() as f64;
     let weight = f64::from(weight);
@@ -133,25 +130,27 @@ fn compare(a: &Image, b: &Image, options: &PhotometricOptions, weight: f32) -> R
     } else {
         (0.0, Image::new(width, height, channels))
     };
-    let (step_ssim, step_l1) = ((-weight * lambda) as f32, (weight * (1.0 - lambda) * scale) as f32);
-    let step_l2 = 2.0 * weight * lambda_l2 * scale;
-    let (mut l1, mut l2) = (0.0f64, 0.0f64);
-    let row = (width * channels).max(1);
-    for ((g, a), b) in grad.data_mut().chunks_mut(row).zip(a.data().chunks(row)).zip(b.data().chunks(row)) {
-        let (mut row_l1, mut row_l2) = (0.0f64, 0.0f64);
-        for i in 0..g.len() {
-            // In f64: the difference of two finite f32 may overflow f32.
-            let d = f64::from(a[i]) - f64::from(b[i]);
-            row_l1 += d.abs();
-            row_l2 += d * d;
-            g[i] = step_ssim * g[i] + step_l1 * subgradient(d as f32) + finite(step_l2 * d);
-        }
-        l1 += row_l1;
-        l2 += row_l2;
-    }
-    let (l1, l2) = (l1 * scale, l2 * scale);
+    let compare = Compare {
+        space: options.space,
+        linear: linear.data(),
+        a: a.data(),
+        b: b.data(),
+        grad: grad.data_mut(),
+        step_ssim: (-weight * lambda) as f32,
+        step_l1: (weight * (1.0 - lambda) * scale) as f32,
+        step_l2: 2.0 * weight * lambda_l2 * scale,
+    };
+    let sums = compare.run(Level::current());
+    let (l1, l2) = (sums.absolute * scale, sums.squared * scale);
     let value = weight * ((1.0 - lambda) * l1 + lambda * dssim + lambda_l2 * l2);
-    Ok(PhotometricLoss { value: finite(value), l1: finite(l1), dssim: dssim as f32, l2: finite(l2), grad })
+    Ok(PhotometricLoss {
+        value: finite(value),
+        l1: finite(l1),
+        dssim: dssim as f32,
+        l2: finite(l2),
+        display_error: (options.space != Transfer::Gamma22).then(|| finite(sums.display * scale)),
+        grad,
+    })
 }
 
 #[cfg(test)]
@@ -174,22 +173,32 @@ mod tests {
     }
 
     #[test]
-    fn an_encoded_photograph_is_the_same_and_the_short_slope_too() {
+    fn an_encoded_photograph_is_the_same() {
         let a = Image::from_vec(4, 3, 3, (0..36).map(|i| (i as f32 * 0.7).sin().abs()).collect()).unwrap();
         let b = a.map(|v| v * 0.5 + 0.1);
         for space in [Transfer::Linear, Transfer::Srgb, Transfer::Gamma22] {
             let options = PhotometricOptions { space, ..Default::default() };
-            let stored = space.encode_image(&b);
+            let stored = encode_image(space, &b);
             assert_eq!(
                 photometric(&a, &b, &options, 1.0).unwrap(),
                 photometric_encoded(&a, &stored, &options, 1.0).unwrap()
             );
-            for v in [0.0, 1e-9, 0.003, 0.0039, 0.0041, -0.3, 0.5, 1.0, 80.0, 1e30, f32::MAX] {
-                let (short, long) = (encode_pull(space, v, space.encode(v), 1.5), space.encode_pull(v, 1.5));
-                // The exponents are rounded to f32, which a logarithm of 88 makes visible.
-                assert!((short - long).abs() <= 1e-5 * long, "{space:?} {v}: {short} {long}");
-            }
         }
+    }
+
+    #[test]
+    fn the_display_error_is_that_of_psnr() {
+        let a = Image::from_vec(4, 3, 3, (0..36).map(|i| (i as f32 * 0.7).sin() * 1.4).collect()).unwrap();
+        let b = a.map(|v| v * 0.5 + 0.1);
+        let display = |image: &Image| image.map(|v| Transfer::Srgb.encode(v).clamp(0.0, 1.0));
+        let expected = diamond_metrics::psnr(&display(&a), &display(&b), 1.0).unwrap();
+        for space in [Transfer::Linear, Transfer::Srgb] {
+            let loss = photometric(&a, &b, &PhotometricOptions { space, ..Default::default() }, 1.0).unwrap();
+            let psnr = -10.0 * f64::from(loss.display_error.unwrap()).log10();
+            assert!((psnr - expected).abs() < 1e-4, "{space:?} {psnr} {expected}");
+        }
+        let gamma = PhotometricOptions { space: Transfer::Gamma22, ..Default::default() };
+        assert_eq!(photometric(&a, &b, &gamma, 1.0).unwrap().display_error, None);
     }
 
     #[test]

@@ -5,7 +5,8 @@
 //! each row is blurred along x once and kept in a ring of eleven; a blurred value is a weighted sum down the ring. The
 //! gradient is the same pipeline once more on the partial derivatives, eleven rows later. Sums are in f64, because the
 //! variance E[s²] − E[s]² of a flat bright image would lose all its digits in f32. No fused multiply-add is used, so
-//! that all instruction sets give the same bits.
+//! that all instruction sets give the same bits, the portable one included.
+use diamond_simd::{Level, Simd, WithSimd};
 
 /// Pixels on either side of the centre of the window.
 pub(crate) const RADIUS: usize = 5;
@@ -305,33 +306,20 @@ fn run(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows
     out
 }
 
-/// [`run`] compiled for AVX2. Same bits.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn run_avx2(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows {
-    run(pair, wanted, band)
-}
+/// [`run`], compiled for each instruction set. Same bits.
+struct Run<'a>(Pair<'a>, Wanted<'a>, std::ops::Range<usize>);
 
-/// [`run`] compiled for AVX-512. Same bits.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f")]
-fn run_avx512(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows {
-    run(pair, wanted, band)
+impl WithSimd for Run<'_> {
+    type Output = Rows;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Rows {
+        run(self.0, self.1, self.2)
+    }
 }
 
 fn run_fastest(pair: Pair<'_>, wanted: Wanted<'_>, band: std::ops::Range<usize>) -> Rows {
-    #[cfg(target_arch = "x86_64")]
-    {
-        if std::arch::is_x86_feature_detected!("avx512f") {
-            // SAFETY: the processor has just said that it has AVX-512F, all that the function asks for.
-            return unsafe { run_avx512(pair, wanted, band) };
-        }
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has just said that it has AVX2, all that the function asks for.
-            return unsafe { run_avx2(pair, wanted, band) };
-        }
-    }
-    run(pair, wanted, band)
+    Level::current().dispatch(Run(pair, wanted, band))
 }
 
 /// All rows of `pair`.
@@ -383,9 +371,11 @@ mod tests {
             let pair = Pair { a: &a, b: &b, width, height, channels, border };
             let wanted = Wanted { map: true, gradient: Some(Cotangent::Uniform(0.3)), both: true };
             let whole = run(pair, wanted, 0..height);
-            let fast = run_fastest(pair, wanted, 0..height);
-            assert_eq!((&whole.sums, &whole.map), (&fast.sums, &fast.map));
-            assert_eq!((&whole.d_a, &whole.d_b), (&fast.d_a, &fast.d_b));
+            for level in Level::testable() {
+                let fast = level.dispatch(Run(pair, wanted, 0..height));
+                assert_eq!((&whole.sums, &whole.map), (&fast.sums, &fast.map), "{level:?}");
+                assert_eq!((&whole.d_a, &whole.d_b), (&fast.d_a, &fast.d_b), "{level:?}");
+            }
             let mut start = 0;
             for length in [1, 3, 20, 14, 7] {
                 let part = run(pair, wanted, start..start + length);

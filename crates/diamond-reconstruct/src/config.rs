@@ -35,7 +35,10 @@ pub struct Config {
     pub model: ModelForm,
     /// The rasteriser's constants.
     pub splat: Splat,
-    /// Adam and its learning rates.
+    /// How Adam goes about it.
+    #[serde(default)]
+    pub adam: Adam,
+    /// Adam's learning rates.
     pub rates: Rates,
     /// Surface shading.
     pub shading: Shading,
@@ -216,7 +219,16 @@ pub struct Splat {
     pub max_scale: f32,
 }
 
-/// Adam and its learning rates, per attribute.
+/// How Adam goes about it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Adam {
+    /// Leave attributes of Gaussians alone whose gradient is 0 in a step, moments included: less memory is moved, and what
+    /// is not seen stays where it is. Without, the first moment carries them on for some steps.
+    pub sparse: bool,
+}
+
+/// Adam's learning rates, per attribute.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rates {

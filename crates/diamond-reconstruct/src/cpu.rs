@@ -97,6 +97,7 @@ impl CpuEngine {
                 Attribute::Codes => rates.codes * factor,
             },
             step + 1,
+            self.model.config.adam.sparse,
         );
         if self.model.config.density.strategy == DensityStrategy::Mcmc {
             let mut random = Random::new(self.model.config.seed, Purpose::Noise, step);
@@ -119,7 +120,7 @@ impl CpuEngine {
                         detail: format!("parameter {i}: {}", gradient[i]),
                     });
                 }
-                adam::adam_step(values, moments, gradient, plan.network_rate, step + 1);
+                adam::adam_step(values, moments, gradient, plan.network_rate, step + 1, adam::Rows::All);
             }
         }
         if let Some((attribute, i)) = self.model.parameters.first_non_finite() {

@@ -64,10 +64,16 @@ fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
 /// Identical pictures count as this many dB, as in `metrics.json`, so that means stay finite.
 const PSNR_CAP: f64 = 150.0;
 
-/// PSNR of two linear images in display sRGB, clamped, peak 1, dB.
-fn display_psnr(rendered: &Image, target: &Image) -> Result<f32, ReconstructError> {
-    let display = |image: &Image| image.map(|v| Transfer::Srgb.encode(v).clamp(0.0, 1.0));
-    let psnr = diamond_metrics::psnr(&display(rendered), &display(target), 1.0).map_err(error::stage("PSNR"))?;
+/// PSNR of two linear images in display sRGB, clamped, peak 1, dB; from the mean squared error where it is known.
+fn display_psnr(rendered: &Image, target: &Image, error: Option<f32>) -> Result<f32, ReconstructError> {
+    let psnr = match error {
+        Some(error) => -10.0 * f64::from(error).log10(),
+        None => {
+            let mut pair = [rendered, target].map(|image| diamond_losses::encode_image(Transfer::Srgb, image));
+            pair.iter_mut().flat_map(|image| image.data_mut()).for_each(|v| *v = v.clamp(0.0, 1.0));
+            diamond_metrics::psnr(&pair[0], &pair[1], 1.0).map_err(error::stage("PSNR"))?
+        }
+    };
     Ok(psnr.min(PSNR_CAP) as f32)
 }
 
@@ -158,7 +164,7 @@ pub fn evaluate(
         let grad = Image::from_vec(w, h, 1, l.d_incident).map_err(error::stage("incident term"))?;
         add_scaled(&mut out.shaded.maps.incident, &grad, share * loss.incident);
     }
-    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance)? })
+    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance, photometric.display_error)? })
 }
 
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.

@@ -2,7 +2,7 @@
 //!
 //! Raw values are what Adam sees: unbounded numbers. [`GaussianParameters::activate`] turns them into Gaussians,
 //! normals and materials; [`GaussianParameters::pull`] takes the gradient back. `[eq:activations]`
-use crate::adam::{Moments, adam_step};
+use crate::adam::{Moments, Rows, adam_step};
 use crate::{Config, Covariance};
 use diamond_light::spherical_harmonics::COEFFICIENTS;
 use diamond_splat::{Gaussians, GaussiansGrad, LowerFactor};
@@ -425,11 +425,13 @@ impl GaussianParameters {
     }
 
     /// One Adam step: `gradients` as from [`GaussianParameters::pull`], `rate` per attribute, `t` from 1.
-    pub fn adam_step(&mut self, gradients: &[Vec<f32>], rate: impl Fn(Attribute) -> f32, t: u64) {
+    /// With `sparse` an attribute of a Gaussian whose gradient is 0 is left alone: see [`Rows::Seen`].
+    pub fn adam_step(&mut self, gradients: &[Vec<f32>], rate: impl Fn(Attribute) -> f32, t: u64, sparse: bool) {
         for (group, gradient) in self.groups.iter_mut().zip(gradients) {
             let rate = rate(group.attribute);
             if rate > 0.0 {
-                adam_step(&mut group.values, &mut group.moments, gradient, rate, t);
+                let rows = if sparse { Rows::Seen { width: group.width } } else { Rows::All };
+                adam_step(&mut group.values, &mut group.moments, gradient, rate, t, rows);
             }
         }
     }

@@ -135,7 +135,7 @@ impl<'a> ChunkNetwork<'a> {
                 columns: widths[l + 1],
                 init: Init::Row(&layer.bias),
             });
-            dispatch(Activate { values: y, stride, columns: widths[l + 1], activation: self.shape.activation(l) });
+            dispatch(Activate { values: y, activation: self.shape.activation(l) });
             (x, rest) = (y, after);
         }
     }

@@ -2,14 +2,14 @@
 //!
 //! One micro-kernel computes C = init + A·B for row-major f32 matrices: a tile of up to 6 rows × 2 vectors of C is held in
 //! registers while the kernel walks along the shared dimension, loading 2 vectors of B and broadcasting 6 values of A per
-//! step. It is written against [`Lanes`]; with the feature `simd` it runs on `pulp`'s dispatch (AVX-512, AVX2 + FMA,
-//! NEON, …), and without it, or on a machine without any of these, on plain arrays of four that never call a
-//! software fused multiply-add.
+//! step. It is written against [`Lanes`] and dispatched by `diamond-simd`; the portable instruction set is replaced by plain
+//! arrays of four, which every compiler target turns into vectors and which have the same bits.
 //!
 //! Bits: every element of C is summed along the shared dimension in ascending order by one accumulator, so the result
-//! depends neither on the tiling nor on how rows are dealt to threads; it does depend on whether the instruction set fuses
-//! multiply and add.
+//! depends neither on the tiling, the number of lanes, nor on how rows are dealt to threads; it does depend on whether the
+//! instruction set fuses multiply and add.
 use crate::mlp::Activation;
+use diamond_simd::{Level, Scalar, Simd, WithSimd};
 
 /// Row strides of every matrix are multiples of this many values, so that every row is a whole number of vectors of any
 /// supported width (AVX-512 holds 16).
@@ -33,6 +33,8 @@ pub(crate) trait Lanes: Copy {
     fn splat(self, value: f32) -> Self::V;
     /// a·b + c, fused where the instruction set has it.
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// 1/(1 + e^−x).
+    fn sigmoid(self, x: Self::V) -> Self::V;
     fn vectors(slice: &[f32]) -> &[Self::V];
     fn vectors_mut(slice: &mut [f32]) -> &mut [Self::V];
 }
@@ -53,6 +55,13 @@ impl Lanes for Plain {
         [a[0] * b[0] + c[0], a[1] * b[1] + c[1], a[2] * b[2] + c[2], a[3] * b[3] + c[3]]
     }
     #[inline(always)]
+    fn sigmoid(self, mut x: [f32; 4]) -> [f32; 4] {
+        for x in &mut x {
+            *x = diamond_simd::sigmoid(diamond_simd::Lanes::new(Scalar::new(), *x)).v;
+        }
+        x
+    }
+    #[inline(always)]
     fn vectors(slice: &[f32]) -> &[[f32; 4]] {
         slice.as_chunks::<4>().0
     }
@@ -62,12 +71,10 @@ impl Lanes for Plain {
     }
 }
 
-#[cfg(feature = "simd")]
 #[derive(Clone, Copy)]
 struct Vectors<S>(S);
 
-#[cfg(feature = "simd")]
-impl<S: pulp::Simd> Lanes for Vectors<S> {
+impl<S: Simd> Lanes for Vectors<S> {
     type V = S::f32s;
     const COUNT: usize = S::F32_LANES;
     #[inline(always)]
@@ -76,7 +83,11 @@ impl<S: pulp::Simd> Lanes for Vectors<S> {
     }
     #[inline(always)]
     fn mul_add(self, a: S::f32s, b: S::f32s, c: S::f32s) -> S::f32s {
-        self.0.mul_add_f32s(a, b, c)
+        self.0.mul_add_e_f32s(a, b, c)
+    }
+    #[inline(always)]
+    fn sigmoid(self, x: S::f32s) -> S::f32s {
+        diamond_simd::sigmoid(diamond_simd::Lanes::new(self.0, x)).v
     }
     #[inline(always)]
     fn vectors(slice: &[f32]) -> &[S::f32s] {
@@ -93,14 +104,18 @@ pub(crate) trait Kernel {
     fn run<L: Lanes>(self, lanes: L);
 }
 
-/// Runs `kernel` on the widest vectors of this machine.
-#[cfg(feature = "simd")]
+/// Runs `kernel` with the instruction set of the process.
 pub(crate) fn dispatch<K: Kernel>(kernel: K) {
+    dispatch_at(Level::current(), kernel);
+}
+
+/// Runs `kernel` with this instruction set.
+fn dispatch_at<K: Kernel>(level: Level, kernel: K) {
     struct Adapter<K>(K);
-    impl<K: Kernel> pulp::WithSimd for Adapter<K> {
+    impl<K: Kernel> WithSimd for Adapter<K> {
         type Output = ();
         #[inline(always)]
-        fn with_simd<S: pulp::Simd>(self, simd: S) {
+        fn with_simd<S: Simd>(self, simd: S) {
             if S::IS_SCALAR || !ROW_ALIGNMENT.is_multiple_of(S::F32_LANES) {
                 self.0.run(Plain)
             } else {
@@ -108,13 +123,7 @@ pub(crate) fn dispatch<K: Kernel>(kernel: K) {
             }
         }
     }
-    pulp::Arch::new().dispatch(Adapter(kernel))
-}
-
-/// Runs `kernel` on plain arrays.
-#[cfg(not(feature = "simd"))]
-pub(crate) fn dispatch<K: Kernel>(kernel: K) {
-    kernel.run(Plain)
+    level.dispatch(Adapter(kernel))
 }
 
 /// What C holds before the product is added.
@@ -267,24 +276,20 @@ fn tile<L: Lanes, const TRANSPOSE_A: bool, const M: usize, const N: usize>(
     }
 }
 
-/// y ← activation(y) in place, on `columns` of each row; the result saturates at [`MAGNITUDE_LIMIT`].
+/// y ← activation(y) in place, padding included; the result saturates at [`MAGNITUDE_LIMIT`].
 pub(crate) struct Activate<'a> {
+    /// Whole rows of a stride that is a multiple of [`ROW_ALIGNMENT`].
     pub values: &'a mut [f32],
-    pub stride: usize,
-    pub columns: usize,
     pub activation: Activation,
 }
 
 impl Kernel for Activate<'_> {
     #[inline(always)]
-    fn run<L: Lanes>(self, _lanes: L) {
-        // Whole strides, padding included, where that is cheap: the padding is zero and stays so.
+    fn run<L: Lanes>(self, lanes: L) {
         let slope = match self.activation {
             Activation::Sigmoid => {
-                for row in self.values.chunks_exact_mut(self.stride) {
-                    for y in &mut row[..self.columns] {
-                        *y = 1.0 / (1.0 + (-*y).exp());
-                    }
+                for y in L::vectors_mut(self.values) {
+                    *y = lanes.sigmoid(*y);
                 }
                 return;
             }
@@ -347,7 +352,7 @@ mod tests {
         ((i * 7919 + 13) % 101) as f32 / 50.0 - 1.0
     }
 
-    fn product(rows: usize, inner: usize, columns: usize, transpose_a: bool, init: Init<'_>, plain: bool) -> Vec<f32> {
+    fn product(rows: usize, inner: usize, columns: usize, transpose_a: bool, init: Init<'_>, level: Level) -> Vec<f32> {
         let a_stride = if transpose_a { padded(rows) } else { padded(inner) };
         let a: Vec<f32> = (0..a_stride * if transpose_a { inner } else { rows }).map(value).collect();
         let stride = padded(columns);
@@ -366,12 +371,25 @@ mod tests {
             columns,
             init,
         };
-        if plain {
-            p.run(Plain)
-        } else {
-            dispatch(p)
-        }
+        dispatch_at(level, p);
         c.chunks(stride).flat_map(|r| r[..columns].to_vec()).collect()
+    }
+
+    #[test]
+    fn sigmoid_is_accurate_and_the_same_at_every_fused_width() {
+        let values: Vec<f32> = (0..64).map(|i| i as f32 * 0.7 - 22.0).collect();
+        let mut fused: Option<Vec<f32>> = None;
+        for level in Level::testable() {
+            let mut got = values.clone();
+            dispatch_at(level, Activate { values: &mut got, activation: Activation::Sigmoid });
+            for (&x, &y) in values.iter().zip(&got) {
+                let expected = 1.0 / (1.0 + (-f64::from(x)).exp());
+                assert!((f64::from(y) - expected).abs() < 4e-7 * expected, "{level:?} {x}: {y}");
+            }
+            if level.is_fused() {
+                assert_eq!(*fused.get_or_insert_with(|| got.clone()), got, "{level:?}");
+            }
+        }
     }
 
     #[test]
@@ -384,8 +402,12 @@ mod tests {
                     let row: Vec<f32> = (0..padded(columns)).map(|i| value(i + 3)).collect();
                     let init = [Init::Zero, Init::Row(&row), Init::Accumulate][mode];
                     let a_stride = if transpose_a { padded(rows) } else { padded(inner) };
-                    for plain in [false, true] {
-                        let got = product(rows, inner, columns, transpose_a, init, plain);
+                    let mut fused: Option<Vec<f32>> = None;
+                    for level in Level::testable() {
+                        let got = product(rows, inner, columns, transpose_a, init, level);
+                        if level.is_fused() {
+                            assert_eq!(*fused.get_or_insert_with(|| got.clone()), got, "{level:?}");
+                        }
                         for r in 0..rows {
                             for c in 0..columns {
                                 let mut expected = match mode {
@@ -400,7 +422,7 @@ mod tests {
                                 let found = f64::from(got[r * columns + c]);
                                 assert!(
                                     (found - expected).abs() < 1e-4,
-                                    "{rows}x{inner}x{columns} transpose {transpose_a} mode {mode} plain {plain}: {found} {expected}"
+                                    "{rows}x{inner}x{columns} transpose {transpose_a} mode {mode} {level:?}: {found} {expected}"
                                 );
                             }
                         }

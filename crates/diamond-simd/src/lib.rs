@@ -55,4 +55,4 @@ pub use elementary::{exp, exp2, exp2_of, exp2_of_all, ln, ln_1p_exp, log2, root_
 pub use instruction_set::{ENVIRONMENT_VARIABLE, InstructionSet, InstructionSetError, current, fix, from_environment};
 pub use lanes::{Lanes, Mask};
 pub use level::Level;
-pub use pulp::{Simd, WithSimd};
+pub use pulp::{Scalar, Simd, WithSimd};

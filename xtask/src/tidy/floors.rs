@@ -37,6 +37,41 @@ const FOR_TESTS: &[&str] = &["proptest", "divan"];
 /// The testkit's name: the one package of ours that any other may use, in tests only.
 const TESTKIT: &str = "diamond-testkit";
 
+/// What `pulp`, and with it `diamond-simd`, compiles.
+const SIMD: &[&str] = &[
+    "pulp",
+    "pulp-wasm-simd-flag",
+    "autocfg",
+    "bitflags",
+    "bytemuck",
+    "cfg-if",
+    "libm",
+    "num-complex",
+    "num-traits",
+    "paste",
+    "raw-cpuid",
+    "reborrow",
+    "version_check",
+];
+
+/// [`SIMD`] and glam.
+const SIMD_AND_GLAM: &[&str] = &[
+    "glam",
+    "pulp",
+    "pulp-wasm-simd-flag",
+    "autocfg",
+    "bitflags",
+    "bytemuck",
+    "cfg-if",
+    "libm",
+    "num-complex",
+    "num-traits",
+    "paste",
+    "raw-cpuid",
+    "reborrow",
+    "version_check",
+];
+
 const fn light(name: &'static str, floor: u8, outside: &'static [&'static str]) -> Package {
     Package { name, floor, outside: Some(outside), optional: &[], alone: Some(&["glam"]) }
 }
@@ -50,19 +85,19 @@ pub const PACKAGES: &[Package] = &[
     Package { name: "diamond-image", floor: 0, outside: Some(&[]), optional: &[], alone: Some(&[]) },
     light("diamond-camera", 0, &["glam"]),
     light("diamond-light", 0, &["glam"]),
-    heavy("diamond-simd", 0, &["pulp"]),
+    Package { name: "diamond-simd", floor: 0, outside: Some(&["pulp"]), optional: &[], alone: Some(SIMD) },
     heavy(TESTKIT, 0, &["proptest"]),
     heavy("diamond-splat", 1, &["glam", "rayon"]),
     Package {
         name: "diamond-shading",
         floor: 1,
         outside: Some(&["glam"]),
-        optional: &["rayon", "pulp"],
-        alone: Some(&["glam"]),
+        optional: &["rayon"],
+        alone: Some(SIMD_AND_GLAM),
     },
-    Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(&[]) },
+    Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(SIMD) },
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2"]),
-    light("diamond-losses", 2, &[]),
+    Package { name: "diamond-losses", floor: 2, outside: Some(&[]), optional: &[], alone: Some(SIMD) },
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd"]),
     heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2"]),
     heavy(
