@@ -126,9 +126,15 @@ impl Image {
     /// Channels `range` as an image of their own. Panics where the range exceeds the channels, like slice indexing.
     pub fn channels_range(&self, range: std::ops::Range<usize>) -> Self {
         let channels = range.len();
-        let mut data = Vec::with_capacity(self.pixels() * channels);
-        for pixel in self.data.chunks_exact(self.channels.max(1)) {
-            data.extend_from_slice(&pixel[range.clone()]);
+        let mut data = vec![0.0; self.pixels() * channels];
+        let from = self.data.chunks_exact(self.channels.max(1));
+        // Copies of a length that the compiler knows are an order of magnitude faster.
+        match channels {
+            0 => {}
+            1 => copy_channels::<1>(&mut data, from, range.start),
+            3 => copy_channels::<3>(&mut data, from, range.start),
+            14 => copy_channels::<14>(&mut data, from, range.start),
+            _ => data.chunks_exact_mut(channels).zip(from).for_each(|(to, p)| to.copy_from_slice(&p[range.clone()])),
         }
         Self { width: self.width, height: self.height, channels, data }
     }
@@ -160,6 +166,13 @@ impl Image {
         let i = self.data.iter().position(|v| !v.is_finite())?;
         let (pixel, c) = (i / self.channels, i % self.channels);
         Some((pixel % self.width, pixel / self.width, c))
+    }
+}
+
+/// The `N` values from `first` on of each pixel.
+fn copy_channels<const N: usize>(to: &mut [f32], from: std::slice::ChunksExact<'_, f32>, first: usize) {
+    for (to, pixel) in to.as_chunks_mut::<N>().0.iter_mut().zip(from) {
+        to.copy_from_slice(&pixel[first..first + N]);
     }
 }
 

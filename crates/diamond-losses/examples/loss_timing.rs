@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use diamond_image::{Image, Mask, Transfer};
 use diamond_losses::*;
+use diamond_metrics::{SsimWindow, ssim_mean_and_grad};
 
 fn best_ms<T>(mut f: impl FnMut() -> Result<T, LossError>) -> Result<f64, LossError> {
     let mut best = f64::INFINITY;
@@ -28,6 +29,13 @@ fn main() -> Result<(), LossError> {
     let srgb = PhotometricOptions { space: Transfer::Srgb, ..linear };
     let average = Average::Inside;
     println!("{side}×{side}, value and gradient, ms");
+    let one_by_one = best_ms(|| Ok(Transfer::Srgb.encode_image(&a)))?;
+    let vectors = best_ms(|| Ok(encode_image(Transfer::Srgb, &a)))?;
+    let per_value = 1e6 / a.data().len() as f64;
+    println!("instruction set: {}", diamond_simd::current());
+    println!("sRGB one by one           {one_by_one:.3} ({:.2} ns per value)", one_by_one * per_value);
+    println!("sRGB on vectors           {vectors:.3} ({:.2} ns per value)", vectors * per_value);
+    println!("SSIM and gradient         {:.2}", best_ms(|| Ok(ssim_mean_and_grad(&a, &b, SsimWindow::ZeroPadded)?))?);
     println!("photometric, linear       {:.2}", best_ms(|| photometric(&a, &b, &linear, 1.0))?);
     println!("photometric, sRGB         {:.2}", best_ms(|| photometric(&a, &b, &srgb, 1.0))?);
     println!("photometric, sRGB stored  {:.2}", best_ms(|| photometric_encoded(&a, &b, &srgb, 1.0))?);

@@ -19,6 +19,7 @@
 use crate::error::{ShadingError, check_length};
 use crate::row_chunks::{map_chunks, map_chunks_mut};
 use crate::simd::MAGNITUDE_LIMIT;
+use diamond_simd::{Lanes, Level, Scalar, Simd, WithSimd, sin_cos_pi};
 use glam::{Quat, Vec3};
 use std::f32::consts::PI;
 
@@ -49,10 +50,18 @@ const ROWS: usize = 512;
 /// an argument reduced exactly by the period; the error stays below 3e-6.
 /// `[eq:positional-encoding]`
 pub fn positional_encoding(x: Vec3) -> [f32; ENCODED_POSITION] {
+    let mut sines = [[0.0; 2]; 3];
+    for (sine, x) in sines.iter_mut().zip(x.to_array()) {
+        let (sin, cos) = sin_cos_pi(Lanes::new(Scalar::new(), reduce(x)));
+        *sine = [sin.v, cos.v];
+    }
+    harmonics(sines)
+}
+
+/// The sines and cosines of all frequencies of the lowest one's, per axis.
+fn harmonics(sines: [[f32; 2]; 3]) -> [f32; ENCODED_POSITION] {
     let mut encoded = [0.0; ENCODED_POSITION];
-    for (axis, x) in x.to_array().into_iter().enumerate() {
-        let reduced = x - 2.0 * (0.5 * x).round();
-        let (mut sin, mut cos) = (PI * reduced).sin_cos();
+    for (axis, [mut sin, mut cos]) in sines.into_iter().enumerate() {
         for k in 0..ENCODING_FREQUENCIES {
             encoded[6 * k + axis] = sin;
             encoded[6 * k + 3 + axis] = cos;
@@ -60,6 +69,40 @@ pub fn positional_encoding(x: Vec3) -> [f32; ENCODED_POSITION] {
         }
     }
     encoded
+}
+
+/// `x` less a whole number of periods: in [−1, 1].
+fn reduce(x: f32) -> f32 {
+    x - 2.0 * (0.5 * x).round()
+}
+
+/// sin(π·x) and cos(π·x) of many numbers.
+struct Sines<'a> {
+    x: &'a [f32],
+    sin: &'a mut [f32],
+    cos: &'a mut [f32],
+}
+
+impl WithSimd for Sines<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let w = S::F32_LANES;
+        for ((x, sin), cos) in self.x.chunks(w).zip(self.sin.chunks_mut(w)).zip(self.cos.chunks_mut(w)) {
+            let (sines, cosines) = match x.len() == w {
+                true => sin_cos_pi(Lanes::load(s, x)),
+                false => sin_cos_pi(Lanes::load_partial(s, x)),
+            };
+            if x.len() == w {
+                sines.store(sin);
+                cosines.store(cos);
+            } else {
+                sines.store_partial(sin);
+                cosines.store_partial(cos);
+            }
+        }
+    }
 }
 
 /// Pullback of [`positional_encoding`]: the cotangent of the normalised position.
@@ -268,18 +311,29 @@ impl<'a> ResidualInputs<'a> {
         check_length("ResidualInputs::codes (rows × K)", rows.saturating_mul(self.code_size), self.codes.len())?;
         let width = self.width();
         let mut matrix = vec![0.0; rows * width];
+        let level = Level::current();
         map_chunks_mut(&mut matrix, ROWS * width, |chunk, matrix| {
+            let first = chunk * ROWS;
+            let count = matrix.len() / width;
+            let mut x = [0.0; 3 * ROWS];
+            for (x, position) in x.as_chunks_mut::<3>().0.iter_mut().zip(&self.positions[first..first + count]) {
+                *x = scaling.normalise(*position).to_array().map(reduce);
+            }
+            let (mut sin, mut cos) = ([0.0; 3 * ROWS], [0.0; 3 * ROWS]);
+            let n = 3 * count;
+            level.dispatch(Sines { x: &x[..n], sin: &mut sin[..n], cos: &mut cos[..n] });
             for (offset, row) in matrix.chunks_exact_mut(width).enumerate() {
-                self.write_row(chunk * ROWS + offset, scaling, row);
+                let sines = std::array::from_fn(|axis| [sin[3 * offset + axis], cos[3 * offset + axis]]);
+                self.write_row(first + offset, sines, scaling, row);
             }
         });
         Ok((matrix, ResidualInputsPullback { inputs: *self, scaling: *scaling }))
     }
 
-    fn write_row(&self, i: usize, scaling: &InputScaling, row: &mut [f32]) {
+    fn write_row(&self, i: usize, sines: [[f32; 2]; 3], scaling: &InputScaling, row: &mut [f32]) {
         let (fixed, code) = row.split_at_mut(RESIDUAL_INPUTS);
         let (encoded, rest) = fixed.split_at_mut(ENCODED_POSITION);
-        encoded.copy_from_slice(&positional_encoding(scaling.normalise(self.positions[i])));
+        encoded.copy_from_slice(&harmonics(sines));
         let q = self.rotations[i];
         rest[..4].copy_from_slice(&[q.w, q.x, q.y, q.z]);
         for (to, from) in rest[4..7].iter_mut().zip(self.scales[i].to_array()) {
