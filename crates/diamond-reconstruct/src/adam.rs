@@ -45,6 +45,9 @@ pub enum Rows {
 /// Values per parallel task; a whole number of blocks of every width.
 const TASK: usize = 1 << 15;
 
+/// Values, first moments, second moments and gradient of a task.
+type Part<'a> = (((&'a mut [f32], &'a mut [f32]), &'a mut [f32]), &'a [f32]);
+
 /// One update of `values` along `gradient`; `t` counts updates from 1. All slices have equal lengths. The same bits
 /// whatever the number of threads.
 pub fn adam_step(values: &mut [f32], moments: &mut Moments, gradient: &[f32], rate: f32, t: u64, rows: Rows) {
@@ -60,7 +63,7 @@ pub fn adam_step(values: &mut [f32], moments: &mut Moments, gradient: &[f32], ra
     let task = TASK / width * width + if TASK < width { width } else { 0 };
     let parts = values.par_chunks_mut(task).zip(moments.first.par_chunks_mut(task));
     let parts = parts.zip(moments.second.par_chunks_mut(task)).zip(gradient.par_chunks(task));
-    let run = |(((values, first), second), gradient): (((&mut [f32], &mut [f32]), &mut [f32]), &[f32])| match rows {
+    let run = |(((values, first), second), gradient): Part<'_>| match rows {
         Rows::All => level.dispatch(Update { values, first, second, gradient, step, scale }),
         Rows::Seen { .. } => each_run(gradient, width, |seen| {
             level.dispatch(Update {
