@@ -320,10 +320,24 @@ pub enum CombineVariant {
     Additive,
 }
 
+/// Whether the surface may be metal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MetalVariant {
+    /// Learned, since photographs do not say; left out of renders of a model in which nothing turned out to be metal.
+    Auto,
+    /// Learned.
+    Yes,
+    /// A dielectric: metalness is 0, neither learned nor rasterised.
+    No,
+}
+
 /// Surface shading.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Shading {
+    /// Metal.
+    pub metal: MetalVariant,
     /// Masking–shadowing.
     pub masking: MaskingVariant,
     /// Fresnel.
@@ -388,6 +402,9 @@ pub struct Visibility {
     pub traced: bool,
     /// A light's visibility is traced again when it is older than this many steps.
     pub every_steps: u64,
+    /// … and some Gaussians have moved, grown or turned by this share of their size, or changed in opacity by as much,
+    /// since the last trace; 0 to trace whenever it is old.
+    pub moved: f32,
     /// Random Gaussians per step on which the SH fit is compared.
     pub samples: usize,
 }
@@ -617,6 +634,7 @@ impl Config {
             ("density.mcmc.noise_opacity", self.density.mcmc.noise_opacity),
             ("shading.roughness_unfreeze", self.shading.roughness_unfreeze),
             ("rates.mean_decay", self.rates.mean_decay),
+            ("visibility.moved", self.visibility.moved),
             ("loss.ssim", self.loss.ssim),
         ];
         for (key, value) in unit {

@@ -5,8 +5,8 @@ use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
-    Activated, ActivatedGrad, Attribute, DensityStrategy, Engine, GaussianParameters, Layout, Model, ReconstructError,
-    Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
+    Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, GaussianParameters, Layout,
+    Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
 };
 use crate::{forward, mcmc};
 use diamond_camera::Camera;
@@ -19,9 +19,11 @@ use std::time::Instant;
 /// The training step and renderer on the CPU.
 pub struct CpuEngine {
     pub(crate) model: Model,
+    needs: Needs,
     pub(crate) visibility: VisibilityCache,
     pub(crate) stats: DensityStats,
     profile: Profile,
+    counters: Counters,
 }
 
 /// Seconds per part of a step.
@@ -59,10 +61,36 @@ fn check_gradients(parameters: &GaussianParameters, gradients: &[Vec<f32>], step
 }
 
 impl CpuEngine {
-    /// An engine that trains `model` further.
+    /// An engine that trains `model` further and computes what its configuration needs.
     pub fn new(model: Model) -> Self {
+        let needs = Needs::decide(&model.config, &CaptureFacts::default());
+        Self::with_needs(model, needs)
+    }
+
+    /// An engine that trains `model` further and computes what `needs` says.
+    pub fn with_needs(model: Model, needs: Needs) -> Self {
         let stats = DensityStats::new(model.len());
-        Self { model, visibility: VisibilityCache::default(), stats, profile: Profile::default() }
+        Self {
+            model,
+            needs,
+            visibility: VisibilityCache::default(),
+            stats,
+            profile: Profile::default(),
+            counters: Counters::default(),
+        }
+    }
+
+    /// Whether an attribute has a gradient at all; one that has none stays as it is without Adam.
+    fn learns(&self, attribute: Attribute, plan: &StepPlan) -> bool {
+        match attribute {
+            Attribute::Roughness => !plan.roughness_frozen,
+            Attribute::Metalness => self.needs.metalness_learned.needed,
+            Attribute::Subsurfaceness => self.needs.subsurfaceness_channel.needed,
+            Attribute::VisibilitySh => self.needs.visibility_sh.needed,
+            Attribute::Transfer => self.needs.transfer.needed,
+            Attribute::Codes => self.needs.codes.needed,
+            _ => true,
+        }
     }
 
     fn apply(
@@ -78,17 +106,20 @@ impl CpuEngine {
         let rates = self.model.config.rates.clone();
         let extent = self.model.scene.extent;
         let factor = plan.attribute_factor;
-        let frozen = plan.roughness_frozen;
+        let learns = Attribute::ALL.map(|attribute| self.learns(attribute, plan));
+        for (group, _) in self.model.parameters.groups().iter().zip(learns).filter(|(_, learns)| !learns) {
+            self.counters.add("Adam values left out", group.values.len());
+        }
         self.model.parameters.adam_step(
             &gradients,
             |attribute| match attribute {
+                attribute if !learns[attribute as usize] => 0.0,
                 Attribute::Mean => plan.mean_rate * extent,
                 Attribute::Scale => rates.scale * factor,
                 Attribute::Rotation => rates.rotation * factor,
                 Attribute::Shear => rates.shear * factor,
                 Attribute::Opacity => rates.opacity * factor,
                 Attribute::Normal => rates.normal * factor,
-                Attribute::Roughness if frozen => 0.0,
                 Attribute::BaseColor | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => {
                     rates.material * factor
                 }
@@ -155,42 +186,43 @@ impl Engine for CpuEngine {
         let mut visible = 0;
         self.profile.add("activate", start);
         let share = 1.0 / batch.len().max(1) as f32;
+        let needs = self.needs.at(plan);
         for pair in batch {
             let settings = forward::Settings::training(&self.model, plan);
-            let traced = match self.model.config.visibility.traced {
+            let traced = match self.model.config.visibility.traced && self.needs.traced_visibility.needed {
                 true => {
                     let t = Instant::now();
-                    let v = self.visibility.get(
-                        &self.model.config,
-                        &activated.gaussians,
-                        &activated.normals,
-                        pair.light,
-                        step,
-                    )?;
+                    let keep = !self.needs.unmoved_visibility.needed;
+                    let g = &activated.gaussians;
+                    let config = &self.model.config.visibility;
+                    let v = self.visibility.get(config, keep, g, &activated.normals, pair.light, step)?;
                     self.profile.add("visibility", t);
                     Some(v)
                 }
                 false => None,
             };
             let light = self.model.scene.scaled_light(pair.light);
-            let config = self.model.config.clone();
-            let mut outcome = None;
-            let pulled = forward::value_and_grad(
-                &self.model,
-                &activated,
-                pair.camera,
-                &light,
+            let pass = forward::Pass {
+                model: &self.model,
+                activated: &activated,
+                camera: pair.camera,
+                light: &light,
                 traced,
-                &settings,
-                &mut self.profile,
-                |view| {
-                    let mut o = objective::evaluate(&config, plan, view, pair, share)?;
-                    let grad = std::mem::take(&mut o.grad);
-                    outcome = Some(o);
-                    Ok(grad)
-                },
-            )?;
+                content: pair.content,
+                settings: &settings,
+                needs: &needs,
+            };
+            let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
+            let mut outcome = None;
+            let pulled = forward::value_and_grad(&pass, &mut meters, |view| {
+                let mut o = objective::evaluate(&self.model.config, &needs, view, pair, share)?;
+                let grad = std::mem::take(&mut o.grad);
+                outcome = Some(o);
+                Ok(grad)
+            })?;
             if let Some(outcome) = outcome {
+                outcome.terms.iter().for_each(|term| self.counters.add(term.name, 1));
+                self.counters.add("PSNR encoded anew", usize::from(outcome.psnr_encoded));
                 terms.add(&outcome.terms, share);
                 psnr += outcome.psnr * share;
             }
@@ -204,7 +236,7 @@ impl Engine for CpuEngine {
             }
             pulled.add_to(&mut total, &mut network_grad)?;
             self.profile.add("accumulate", t);
-            if let (Some(traced), true) = (traced, self.model.config.loss.visibility > 0.0) {
+            if let (Some(traced), true) = (traced, self.needs.visibility_sh.needed) {
                 let t = Instant::now();
                 let mut random = Random::new(self.model.config.seed, Purpose::VisibilitySamples, step);
                 let value = objective::visibility_term(
@@ -216,10 +248,13 @@ impl Engine for CpuEngine {
                     &mut total.visibility_sh,
                 )?;
                 terms.add(&[value], share);
+                self.counters.add(value.name, 1);
                 self.profile.add("visibility term", t);
             }
         }
-        objective::regularise(&self.model, &mut total, &mut terms);
+        if self.needs.transfer_smoothness.needed {
+            objective::regularise(&self.model, &mut total, &mut terms);
+        }
         mcmc::regularise(&self.model, &activated.gaussians, &mut total, &mut terms);
         let objective_value = terms.objective();
         if !objective_value.is_finite() {
@@ -247,7 +282,7 @@ impl Engine for CpuEngine {
     }
 
     fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
-        forward::render(&self.model, camera, lights)
+        self.model.render(camera, lights)
     }
 
     fn model(&mut self) -> Result<&Model, ReconstructError> {
@@ -270,11 +305,7 @@ impl Engine for CpuEngine {
             file.insert(format!("network.{name}.first_moment"), &shape, moments.first.clone());
             file.insert(format!("network.{name}.second_moment"), &shape, moments.second.clone());
         }
-        for (key, step, values) in self.visibility.entries() {
-            let name = key.iter().map(|k| format!("{k:08x}")).collect::<Vec<_>>().join("-");
-            file.insert(format!("visibility.{name}"), &[values.len()], values.to_vec());
-            file.metadata.insert(format!("visibility.{name}.step"), step.to_string());
-        }
+        self.visibility.store(&mut file);
         // Counts are far below 2²⁴, so f32 holds them exactly.
         let views = self.stats.views.iter().map(|&v| v as f32).collect();
         file.insert("density.gradient_sum", &[n], self.stats.gradient_sum.clone());
@@ -308,28 +339,25 @@ impl Engine for CpuEngine {
             views: state.take(path, "density.views", n)?.iter().map(|&v| v as u32).collect(),
             max_radius: state.take(path, "density.max_radius", n)?,
         };
-        self.visibility = VisibilityCache::default();
-        let names: Vec<String> = state.tensors.keys().filter(|k| k.starts_with("visibility.")).cloned().collect();
-        for name in names {
-            let bad = || ReconstructError::Checkpoint {
-                path: path.to_owned(),
-                detail: format!("tensor `{name}`: its name does not identify a light"),
-            };
-            let fields: Vec<u32> = name["visibility.".len()..]
-                .split('-')
-                .map(|h| u32::from_str_radix(h, 16).map_err(|_| bad()))
-                .collect::<Result<_, _>>()?;
-            let key: [u32; 4] = fields.try_into().map_err(|_| bad())?;
-            let step = state.metadata_value(path, &format!("{name}.step"))?;
-            let values = state.take(path, &name, n)?;
-            self.visibility.restore(key, step, values);
-        }
+        self.visibility = VisibilityCache::restore(path, &mut state, n)?;
         self.model.parameters = parameters;
         Ok(())
     }
 
     fn profile(&self) -> Vec<(&'static str, f64)> {
         self.profile.parts.clone()
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        let v = &self.visibility;
+        let mut all = self.counters.all().to_vec();
+        all.extend([
+            ("visibility look-ups", v.lookups),
+            ("visibility traced", v.traced),
+            ("visibility kept, nothing moved", v.kept),
+            ("hierarchies built", v.built),
+        ]);
+        all
     }
 }
 

@@ -1,5 +1,6 @@
 //! What runs a training step and renders: the CPU now, a GPU later, behind one trait.
 use crate::objective::TermValue;
+use crate::region::Region;
 use crate::{Model, ReconstructError, StepPlan, TensorFile};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask};
@@ -20,6 +21,8 @@ pub struct TrainingPair<'a> {
     pub mask: Option<&'a Mask>,
     /// Weight in the photometric terms (1 for photographs).
     pub weight: f32,
+    /// The rectangle outside of which `radiance` and `mask` are 0 everywhere; `None` where they are so altogether.
+    pub content: Option<Region>,
 }
 
 /// What one training step did.
@@ -83,4 +86,7 @@ pub trait Engine {
 
     /// Seconds spent so far in each part of a step, in order.
     fn profile(&self) -> Vec<(&'static str, f64)>;
+
+    /// How much work the steps so far were, and would have been without leaving anything out.
+    fn counters(&self) -> Vec<(&'static str, u64)>;
 }

@@ -1,19 +1,24 @@
 //! From raw parameters to a picture under one light, and the way back: the stages between the parameters and the
 //! objective, in the order in which they run.
 use crate::cpu::Profile;
+use crate::needs::StepNeeds;
+use crate::region::{NEIGHBOUR_REACH, Region, SSIM_REACH};
+use crate::rows::{
+    LightRows, Rows, Transported, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
+};
 use crate::{
-    Activated, ActivatedGrad, Attribute, CombineVariant, DiffuseVariant, FresnelVariant, IncidentVariant,
-    MaskingVariant, Model, ReconstructError, Rendering, StepPlan, error, visibility_cache,
+    Activated, ActivatedGrad, CombineVariant, Counters, DiffuseVariant, FresnelVariant, IncidentVariant,
+    MaskingVariant, Model, ReconstructError, StepPlan, error,
 };
 use diamond_camera::Camera;
-use diamond_light::{OlatLight, spherical_harmonics};
+use diamond_image::Image;
+use diamond_light::OlatLight;
 use diamond_shading::{
-    BrdfModel, Combine, Diffuse, Fresnel, GBuffer, IncidentModel, InputGradients, InputScaling, LightDistanceInput,
-    Masking, Prepared, ResidualInputs, Shaded, ShadedGrad, ShadingConfig, SurfaceVisibility, TransferActivation,
-    TransferConfig, channel, shade, transfer_radiance,
+    BrdfModel, Combine, Diffuse, Fresnel, GBuffer, IncidentModel, InputGradients, Masking, ResidualNetworkGrad, Shaded,
+    ShadedGrad, ShadingConfig, SurfaceVisibility, channel, shade, transfer_radiance,
 };
-use diamond_splat::{Cutoff, Features, Raster, RasterConfig, RasterGrad, project, rasterize_projected};
-use glam::{Quat, Vec2, Vec3};
+use diamond_splat::{Cutoff, RasterConfig, RasterGrad, project, rasterize_projected};
+use glam::{Vec2, Vec3};
 use std::time::Instant;
 
 /// The rasteriser's settings under a configuration.
@@ -33,7 +38,8 @@ pub fn raster_config(model: &Model) -> RasterConfig {
 /// Settings of one forward pass.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    shading: ShadingConfig,
+    /// Of the shader.
+    pub shading: ShadingConfig,
     incident_gradient: bool,
     normal_gradient: bool,
 }
@@ -94,10 +100,14 @@ const FROZEN_ROUGHNESS: f32 = 0.5;
 
 /// What the objective sees of a forward pass.
 pub struct View<'a> {
-    /// The shaded picture and its maps.
+    /// The shaded picture and its maps, of the region.
     pub shaded: &'a Shaded,
-    /// Blended features, opacity, depth.
-    pub raster: &'a Raster,
+    /// Opacity, of the region.
+    pub opacity: &'a Image,
+    /// The camera of the region.
+    pub camera: &'a Camera,
+    /// The part of the picture that is compared; outside of it everything is empty.
+    pub region: Region,
 }
 
 /// The objective's gradient.
@@ -105,8 +115,8 @@ pub struct View<'a> {
 pub struct ViewGrad {
     /// With respect to radiance and maps.
     pub shaded: ShadedGrad,
-    /// With respect to the raster's opacity, if any.
-    pub opacity: Option<diamond_image::Image>,
+    /// With respect to the opacity, if any.
+    pub opacity: Option<Image>,
 }
 
 /// Gradient of one pair with respect to what the parameters mean, and to the network.
@@ -123,129 +133,69 @@ pub struct PairGrad {
     pub visible: usize,
 }
 
-/// The inputs of the visible Gaussians' residual, row by row.
-struct Rows {
-    visible: Vec<u32>,
-    positions: Vec<Vec3>,
-    rotations: Vec<Quat>,
-    scales: Vec<Vec3>,
-    normals: Vec<Vec3>,
-    view_directions: Vec<Vec3>,
-    codes: Vec<f32>,
-    transfer: Vec<f32>,
+/// What one pair's forward and backward pass works on.
+pub struct Pass<'a> {
+    /// The model.
+    pub model: &'a Model,
+    /// Its parameters' meaning.
+    pub activated: &'a Activated,
+    /// From where.
+    pub camera: &'a Camera,
+    /// Under which light, scaled to the scene.
+    pub light: &'a OlatLight,
+    /// Traced visibility of every Gaussian, where it is traced.
+    pub traced: Option<&'a [f32]>,
+    /// The rectangle of the photograph outside of which it and its mask are empty; `None` where they are everywhere.
+    pub content: Option<Region>,
+    /// Settings of the pass.
+    pub settings: &'a Settings,
+    /// What is computed.
+    pub needs: &'a StepNeeds,
 }
 
-fn gather(values: &[f32], width: usize, rows: &[u32]) -> Vec<f32> {
-    rows.iter().flat_map(|&i| values[i as usize * width..(i as usize + 1) * width].iter().copied()).collect()
+/// Where the time of a pass goes, and how much work it is.
+pub struct Meters<'a> {
+    /// Seconds.
+    pub profile: &'a mut Profile,
+    /// Work.
+    pub counters: &'a mut Counters,
 }
 
-impl Rows {
-    fn new(model: &Model, activated: &Activated, camera: &Camera, visible: &[u32]) -> Self {
-        let eye = camera.pose.centre();
-        let pick = |v: &[Vec3]| visible.iter().map(|&i| v[i as usize]).collect::<Vec<Vec3>>();
-        let g = &activated.gaussians;
-        let positions = pick(&g.means);
-        let residual = &model.config.residual;
-        Self {
-            view_directions: positions.iter().map(|p| (eye - *p).try_normalize().unwrap_or(Vec3::Z)).collect(),
-            rotations: visible.iter().map(|&i| unit(g.rotations[i as usize])).collect(),
-            scales: pick(&g.scales),
-            normals: pick(&activated.normals),
-            codes: gather(model.parameters.values(Attribute::Codes), residual.codes, visible),
-            transfer: gather(model.parameters.values(Attribute::Transfer), residual.transfer_width(), visible),
-            positions,
-            visible: visible.to_vec(),
+impl Pass<'_> {
+    /// The part of the picture that is shaded and compared: photograph, mask and `opacity` are empty outside of it.
+    fn region(&self, opacity: &Image) -> Region {
+        let (width, height, _) = opacity.shape();
+        if self.needs.all_pixels {
+            return Region::whole(width, height);
+        }
+        let margin = if self.needs.window { SSIM_REACH } else { NEIGHBOUR_REACH };
+        match Region::union(self.content, Region::of_image(opacity)) {
+            Some(region) => region.grown(margin, width, height),
+            None => Region::whole(width, height),
         }
     }
-
-    fn len(&self) -> usize {
-        self.visible.len()
-    }
-}
-
-/// Quaternions shorter than this have no direction.
-const MIN_QUATERNION: f32 = 1e-12;
-
-fn unit(q: Quat) -> Quat {
-    let length = q.length();
-    if length > MIN_QUATERNION { q / length } else { Quat::IDENTITY }
-}
-
-/// The light-dependent inputs, row by row.
-struct LightRows {
-    /// Visibility used for shading: traced where it was, else the SH fit.
-    visibility: Vec<f32>,
-    /// Unit direction to the light.
-    directions: Vec<Vec3>,
-    /// Distance to the light, scene units; infinite for directional lights.
-    distances: Vec<f32>,
-}
-
-impl LightRows {
-    fn new(model: &Model, rows: &Rows, light: &OlatLight, traced: Option<&[f32]>) -> Result<Self, ReconstructError> {
-        let incidence: Vec<_> =
-            rows.positions.iter().map(|p| light.incidence(*p, diamond_light::Falloff::None)).collect();
-        let directions: Vec<Vec3> = incidence.iter().map(|i| i.direction).collect();
-        let visibility = match traced {
-            Some(v) => rows.visible.iter().map(|&i| v[i as usize]).collect(),
-            None => {
-                let sh = gather(
-                    model.parameters.values(Attribute::VisibilitySh),
-                    spherical_harmonics::COEFFICIENTS,
-                    &rows.visible,
-                );
-                diamond_shading::sh_visibility::visibilities(&sh, &directions).map_err(error::stage("visibility"))?
-            }
-        };
-        Ok(Self { visibility, directions, distances: incidence.iter().map(|i| i.distance).collect() })
-    }
-}
-
-fn residual_inputs<'a>(model: &Model, rows: &'a Rows, lit: &'a LightRows) -> ResidualInputs<'a> {
-    ResidualInputs {
-        positions: &rows.positions,
-        rotations: &rows.rotations,
-        scales: &rows.scales,
-        view_directions: &rows.view_directions,
-        light_directions: &lit.directions,
-        normals: &rows.normals,
-        visibility: &lit.visibility,
-        light_distances: &lit.distances,
-        codes: &rows.codes,
-        code_size: model.config.residual.codes,
-    }
-}
-
-fn input_scaling(model: &Model) -> InputScaling {
-    let (centre, half) = (model.scene.centre(), Vec3::splat(model.scene.radius));
-    let mut scaling = InputScaling::of_bounds(centre - half, centre + half);
-    scaling.light_distance = LightDistanceInput::Bounded { reference: model.scene.light_distance };
-    scaling
-}
-
-fn transfer_config(model: &Model) -> Option<TransferConfig> {
-    let residual = &model.config.residual;
-    let degree = residual.transfer_degree as usize;
-    residual.transfer.then_some(TransferConfig { degree, activation: TransferActivation::Linear })
 }
 
 /// Runs one pair forward, asks `objective` for the gradient, and runs the pair backward.
 pub fn value_and_grad(
-    model: &Model,
-    activated: &Activated,
-    camera: &Camera,
-    light: &OlatLight,
-    traced: Option<&[f32]>,
-    settings: &Settings,
-    profile: &mut Profile,
+    pass: &Pass<'_>,
+    meters: &mut Meters<'_>,
     objective: impl FnOnce(&View<'_>) -> Result<ViewGrad, ReconstructError>,
 ) -> Result<PairGrad, ReconstructError> {
+    let Pass { model, activated, camera, light, settings, needs, .. } = *pass;
+    let Meters { profile, counters } = meters;
+    let layout = &needs.layout;
     let n = model.len();
     let t = Instant::now();
     let projection = project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
     let t = profile.add("project", t);
     let rows = Rows::new(model, activated, camera, projection.visible());
-    let lit = LightRows::new(model, &rows, light, traced)?;
+    let source = match pass.traced {
+        _ if !needs.visibility => VisibilitySource::Unread,
+        Some(traced) => VisibilitySource::Traced(traced),
+        None => VisibilitySource::Fitted,
+    };
+    let lit = LightRows::new(model, &rows, light, source)?;
     let inputs = residual_inputs(model, &rows, &lit);
     let scaling = input_scaling(model);
     let assembled = match &model.network {
@@ -254,7 +204,7 @@ pub fn value_and_grad(
     };
     let network = match (&model.network, &assembled) {
         (Some(network), Some((matrix, _))) => {
-            Some(network.forward(matrix, rows.len()).map_err(error::stage("residual network"))?)
+            Some(network.forward(matrix, rows.len()).map_err(error::stage("residual network"))?.0)
         }
         _ => None,
     };
@@ -265,63 +215,90 @@ pub fn value_and_grad(
         None => None,
     };
     let t = profile.add("residual forward", t);
-    let mut features = geometry_features(activated, &rows);
-    write_transport(
-        &mut features,
-        channel::TRANSPORT.start,
-        &rows,
-        network.as_ref().map(|(out, _)| (out.residual.as_slice(), out.incident.as_slice())),
-        transfer.as_ref().map(|(radiance, _)| radiance.as_slice()),
-        &lit.visibility,
-    );
+    let mut features = geometry_features(activated, &rows.visible, layout);
+    let transported = Transported {
+        network: network.as_ref().map(|out| (out.residual.as_slice(), out.incident.as_slice())),
+        transfer: transfer.as_ref().map(|(radiance, _)| radiance.as_slice()),
+        visibility: &lit.visibility,
+    };
+    transported.write(&mut features, 0, &rows.visible, layout);
     let t = profile.add("features", t);
     let (raster, raster_pullback) =
         rasterize_projected(&projection, &activated.gaussians, &features).map_err(error::stage("rasterize"))?;
     let t = profile.add("rasterize forward", t);
-    let gbuffer = GBuffer { features: &raster.features, opacity: &raster.opacity, depth: &raster.depth };
-    let (shaded, shade_pullback) = shade(&gbuffer, camera, light, &settings.shading).map_err(error::stage("shade"))?;
+    let (width, height, _) = raster.opacity.shape();
+    let region = pass.region(&raster.opacity);
+    let cropped = |image: &Image| region.crop(image).map_err(error::stage("region"));
+    let blended = layout.unpack(&raster.features, &region);
+    let (opacity, depth) = (cropped(&raster.opacity)?, cropped(&raster.depth)?);
+    let gbuffer = GBuffer { features: &blended, opacity: &opacity, depth: &depth };
+    let part = region.camera(camera);
+    let (shaded, shade_pullback) = shade(&gbuffer, &part, light, &settings.shading).map_err(error::stage("shade"))?;
     let t = profile.add("shade forward", t);
 
-    let grad = objective(&View { shaded: &shaded, raster: &raster })?;
+    let grad = objective(&View { shaded: &shaded, opacity: &opacity, camera: &part, region })?;
     let t = profile.add("objective", t);
 
     let mut d = shade_pullback.pull(&grad.shaded).map_err(error::stage("shade.pull"))?;
     if let Some(d_opacity) = grad.opacity {
         d.opacity.data_mut().iter_mut().zip(d_opacity.data()).for_each(|(a, b)| *a += b);
     }
+    let d = RasterGrad {
+        features: layout.pack(&d.features, &region, width, height),
+        opacity: region.paste(&d.opacity, width, height),
+        depth: region.paste(&d.depth, width, height),
+    };
     let t = profile.add("shade backward", t);
-    let pulled = raster_pullback
-        .pull(&RasterGrad { features: d.features, opacity: d.opacity, depth: d.depth })
-        .map_err(error::stage("rasterize.pull"))?;
+    let pulled = raster_pullback.pull(&d).map_err(error::stage("rasterize.pull"))?;
     let t = profile.add("rasterize backward", t);
 
     let mut out = ActivatedGrad { gaussians: pulled.gaussians, ..zero_materials(n) };
-    let count = channel::COUNT;
+    let count = layout.count();
     let mut d_residual = vec![0.0; 3 * rows.len()];
     let mut d_incident = vec![0.0; rows.len()];
     for (row, &i) in rows.visible.iter().enumerate() {
         let i = i as usize;
         let d = &pulled.features[i * count..(i + 1) * count];
-        out.base_color[i] = Vec3::from_slice(&d[channel::BASE_COLOR]);
-        out.roughness[i] = d[channel::ROUGHNESS];
-        out.metalness[i] = d[channel::METALNESS];
-        out.subsurfaceness[i] = d[channel::SUBSURFACENESS];
-        out.normals[i] = Vec3::from_slice(&d[channel::NORMAL]);
-        d_residual[3 * row..3 * row + 3].copy_from_slice(&d[channel::RESIDUAL]);
-        d_incident[row] = d[channel::INCIDENT];
+        let vector = |c: std::ops::Range<usize>| Vec3::from_array(std::array::from_fn(|k| layout.get(d, c.start + k)));
+        out.base_color[i] = vector(channel::BASE_COLOR);
+        out.roughness[i] = layout.get(d, channel::ROUGHNESS);
+        out.metalness[i] = layout.get(d, channel::METALNESS);
+        out.subsurfaceness[i] = layout.get(d, channel::SUBSURFACENESS);
+        out.normals[i] = vector(channel::NORMAL);
+        d_residual[3 * row..3 * row + 3].copy_from_slice(&vector(channel::RESIDUAL).to_array());
+        d_incident[row] = layout.get(d, channel::INCIDENT);
     }
     let mut network_grad = Vec::new();
-    if let (Some((_, pullback)), Some((_, inputs_pullback))) = (&network, &assembled) {
-        let has_incident = model.network.as_ref().is_some_and(|n| n.incident_head.is_some());
-        let d_incident: &[f32] = if has_incident && settings.incident_gradient { &d_incident } else { &[] };
+    let mut backward_rows = 0;
+    if let (Some(network), Some((matrix, inputs_pullback))) = (&model.network, &assembled) {
+        let has_incident = network.incident_head.is_some() && settings.incident_gradient;
         let codes = model.config.residual.codes;
-        let grad = pullback
-            .pull(&d_residual, d_incident, codes > 0 || settings.normal_gradient)
+        // Gaussians that no pixel passes a gradient to add exactly nothing to the network's.
+        let live: Vec<usize> = (0..rows.len())
+            .filter(|&row| {
+                needs.hidden_rows
+                    || d_residual[3 * row..3 * row + 3] != [0.0; 3]
+                    || (has_incident && d_incident[row] != 0.0)
+            })
+            .collect();
+        backward_rows = live.len();
+        let take = |values: &[f32], width: usize| -> Vec<f32> {
+            live.iter().flat_map(|&row| &values[row * width..(row + 1) * width]).copied().collect()
+        };
+        let width = network.inputs();
+        let (matrix, d_live) = (take(matrix, width), take(&d_residual, 3));
+        let d_live_incident = if has_incident { take(&d_incident, 1) } else { Vec::new() };
+        let mut grad = network
+            .pullback(&matrix, live.len())
+            .and_then(|pullback| pullback.pull(&d_live, &d_live_incident, needs.input_gradient))
             .map_err(error::stage("residual network.pull"))?;
-        if let Some(d_inputs) = &grad.inputs {
-            let d = inputs_pullback
-                .pull(d_inputs, InputGradients::Learned)
-                .map_err(error::stage("residual inputs.pull"))?;
+        if let Some(d_inputs) = grad.inputs.take() {
+            let mut all = vec![0.0; rows.len() * width];
+            for (&row, d) in live.iter().zip(d_inputs.chunks_exact(width)) {
+                all[row * width..(row + 1) * width].copy_from_slice(d);
+            }
+            let d =
+                inputs_pullback.pull(&all, InputGradients::Learned).map_err(error::stage("residual inputs.pull"))?;
             out.codes = vec![0.0; n * codes];
             for (row, &i) in rows.visible.iter().enumerate() {
                 let i = i as usize;
@@ -331,12 +308,7 @@ pub fn value_and_grad(
                 }
             }
         }
-        network_grad = vec![grad.trunk, grad.residual_head];
-        if let (Some(head), Some(network)) = (grad.incident_head, &model.network)
-            && network.incident_head.is_some()
-        {
-            network_grad.push(head);
-        }
+        network_grad = parts_of(grad, network.incident_head.is_some());
     }
     if let Some((_, pullback)) = &transfer {
         let grad = pullback.pull(&d_residual, false).map_err(error::stage("transfer vectors.pull"))?;
@@ -348,6 +320,20 @@ pub fn value_and_grad(
         }
     }
     profile.add("residual backward", t);
+    for (name, count) in [
+        ("pairs", 1),
+        ("Gaussians", n),
+        ("visible Gaussians", rows.len()),
+        ("network rows forward", if model.network.is_some() { rows.len() } else { 0 }),
+        ("network rows backward", backward_rows),
+        ("channels", channel::COUNT),
+        ("channels rasterised", layout.count()),
+        ("pixels", width * height),
+        ("pixels shaded", region.pixels()),
+        ("visibility rows", if needs.visibility { rows.len() } else { 0 }),
+    ] {
+        counters.add(name, count);
+    }
     Ok(PairGrad {
         activated: out,
         network: network_grad,
@@ -355,6 +341,13 @@ pub fn value_and_grad(
         radii: projection.radii().to_vec(),
         visible: rows.len(),
     })
+}
+
+/// The network's gradient: trunk, residual head, and incident head where there is one.
+fn parts_of(grad: ResidualNetworkGrad, has_incident: bool) -> Vec<Vec<f32>> {
+    let mut parts = vec![grad.trunk, grad.residual_head];
+    parts.extend(grad.incident_head.filter(|_| has_incident));
+    parts
 }
 
 fn zero_materials(n: usize) -> ActivatedGrad {
@@ -366,118 +359,4 @@ fn zero_materials(n: usize) -> ActivatedGrad {
         subsurfaceness: vec![0.0; n],
         ..Default::default()
     }
-}
-
-/// Feature rows of the visible Gaussians with the light-independent channels filled in.
-fn geometry_features(activated: &Activated, rows: &Rows) -> Features {
-    let mut features = Features::zeros(activated.gaussians.len(), channel::COUNT);
-    for &i in &rows.visible {
-        let i = i as usize;
-        let row = features.row_mut(i);
-        row[channel::BASE_COLOR].copy_from_slice(&activated.base_color[i].to_array());
-        row[channel::ROUGHNESS] = activated.roughness[i];
-        row[channel::METALNESS] = activated.metalness[i];
-        row[channel::SUBSURFACENESS] = activated.subsurfaceness[i];
-        row[channel::NORMAL].copy_from_slice(&activated.normals[i].to_array());
-    }
-    features
-}
-
-/// Writes residual, incident light and visibility of one light into channels `first..first + 5` of the visible rows.
-fn write_transport(
-    features: &mut Features,
-    first: usize,
-    rows: &Rows,
-    network: Option<(&[f32], &[f32])>,
-    transfer: Option<&[f32]>,
-    visibility: &[f32],
-) {
-    let base = channel::TRANSPORT.start;
-    let at = |c: usize| first + c - base;
-    for (row, &i) in rows.visible.iter().enumerate() {
-        let out = features.row_mut(i as usize);
-        for k in 0..3 {
-            let network = network.map_or(0.0, |(residual, _)| residual[3 * row + k]);
-            out[at(channel::RESIDUAL.start + k)] = network + transfer.map_or(0.0, |t| t[3 * row + k]);
-        }
-        out[at(channel::INCIDENT)] = network.map_or(0.0, |(_, incident)| incident.get(row).copied().unwrap_or(0.0));
-        out[at(channel::VISIBILITY)] = visibility[row];
-    }
-}
-
-/// Lights whose residuals are blended in one rasterisation: bounds the memory of their channels.
-const LIGHTS_PER_RASTERISATION: usize = 16;
-
-/// Renders one camera under each light: one projection, one rasterisation for every [`LIGHTS_PER_RASTERISATION`] lights,
-/// residual and shading per light.
-pub fn render(model: &Model, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
-    let activated = model.parameters.activate();
-    let settings = Settings::rendering(model);
-    let projection = project(&activated.gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
-    let rows = Rows::new(model, &activated, camera, projection.visible());
-    let tracer = match model.config.visibility.traced {
-        true => Some(visibility_cache::Tracer::new(&activated.gaussians)?),
-        false => None,
-    };
-    let geometry = geometry_features(&activated, &rows);
-    let scaling = input_scaling(model);
-    let mut out = Vec::with_capacity(lights.len());
-    for group in lights.chunks(LIGHTS_PER_RASTERISATION) {
-        let (fixed, per_light) = (channel::GEOMETRY.len(), channel::TRANSPORT.len());
-        let mut features = Features::zeros(activated.gaussians.len(), fixed + per_light * group.len());
-        for &i in &rows.visible {
-            let i = i as usize;
-            features.row_mut(i)[channel::GEOMETRY].copy_from_slice(&geometry.row(i)[channel::GEOMETRY]);
-        }
-        for (k, light) in group.iter().enumerate() {
-            let traced = match &tracer {
-                Some(tracer) => Some(tracer.trace(&activated.gaussians, &activated.normals, light)?),
-                None => None,
-            };
-            let lit = LightRows::new(model, &rows, light, traced.as_deref())?;
-            let network = match &model.network {
-                Some(network) => {
-                    let inputs = residual_inputs(model, &rows, &lit);
-                    let (matrix, _) = inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?;
-                    Some(network.forward(&matrix, rows.len()).map_err(error::stage("residual network"))?.0)
-                }
-                None => None,
-            };
-            let transfer = match transfer_config(model) {
-                Some(config) => Some(
-                    transfer_radiance(&rows.transfer, &lit.directions, config)
-                        .map_err(error::stage("transfer vectors"))?
-                        .0,
-                ),
-                None => None,
-            };
-            write_transport(
-                &mut features,
-                fixed + per_light * k,
-                &rows,
-                network.as_ref().map(|o| (o.residual.as_slice(), o.incident.as_slice())),
-                transfer.as_deref(),
-                &lit.visibility,
-            );
-        }
-        let (raster, _) =
-            rasterize_projected(&projection, &activated.gaussians, &features).map_err(error::stage("rasterize"))?;
-        let blended = raster.features.channels_range(channel::GEOMETRY);
-        let gbuffer = GBuffer { features: &blended, opacity: &raster.opacity, depth: &raster.depth };
-        let prepared = Prepared::new(&gbuffer, camera, &settings.shading).map_err(error::stage("shade"))?;
-        for (k, light) in group.iter().enumerate() {
-            let first = fixed + per_light * k;
-            let transport = raster.features.channels_range(first..first + per_light);
-            let shaded =
-                prepared.shade(&model.scene.scaled_light(light), Some(&transport)).map_err(error::stage("shade"))?;
-            out.push(Rendering {
-                radiance: shaded.radiance,
-                surface: shaded.surface,
-                subsurface: shaded.subsurface,
-                opacity: raster.opacity.clone(),
-                maps: shaded.maps,
-            });
-        }
-    }
-    Ok(out)
 }

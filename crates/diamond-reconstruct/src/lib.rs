@@ -15,34 +15,47 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 pub mod adam;
+mod channel_layout;
 mod config;
+mod counters;
 mod cpu;
 mod density_control;
 mod engine;
 mod error;
+mod facts;
 mod forward;
 mod instruction_choice;
 mod mcmc;
 mod model;
+mod needs;
 mod objective;
 mod pairs;
 mod parameters;
 pub mod random;
 mod reconstruction;
+mod region;
+mod render;
+mod rows;
 mod scene;
 mod schedule;
 mod tensor_file;
 mod visibility_cache;
 
+pub use channel_layout::ChannelLayout;
 pub use config::*;
+pub use counters::Counters;
 pub use cpu::{CpuEngine, Profile};
 pub use engine::{Engine, Rendering, StepReport, TrainingPair};
 pub use error::ReconstructError;
+pub use facts::CaptureFacts;
 pub use instruction_choice::InstructionChoice;
 pub use model::Model;
+pub use needs::{Decision, Kind, NIL, NeedRow, Needs, RenderNeeds, StepNeeds};
 pub use objective::TermValue;
 pub use parameters::{Activated, ActivatedGrad, Attribute, GaussianParameters, Group, Layout, logit, sigmoid};
 pub use reconstruction::Reconstruction;
+pub use region::Region;
+pub use render::{RenderWork, Renderer};
 pub use scene::{InitialPoints, InitialSplats, Scene, survey};
 pub use schedule::StepPlan;
 pub use tensor_file::{TensorFile, write_atomically};

@@ -4,8 +4,8 @@ use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::tensor_file::write_atomically;
 use crate::{
-    Attribute, Config, Covariance, GaussianParameters, InitialNormals, Layout, ReconstructError, Rendering, Scene,
-    TensorFile, error, forward, logit,
+    Attribute, Config, Covariance, GaussianParameters, InitialNormals, Layout, MetalVariant, ReconstructError,
+    Renderer, Rendering, Scene, TensorFile, error, logit,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
@@ -73,6 +73,9 @@ impl Model {
             set(Attribute::Mean, &p.to_array());
             set(Attribute::Opacity, &[logit(config.initial.opacity)]);
             set(Attribute::Normal, &normal.to_array());
+            if config.shading.metal == MetalVariant::No {
+                set(Attribute::Metalness, &[logit(0.0)]);
+            }
             let (mut scales, mut orientation) =
                 (Vec3::new(width, width, width * config.initial.flatness.max(1e-3)), rotation);
             if let Some(splats) = &points.splats {
@@ -95,9 +98,9 @@ impl Model {
         Ok(Self { parameters, network, network_moments, scene, config: config.clone() })
     }
 
-    /// Renders one camera under each light: one projection and one rasterisation per group of lights.
+    /// Renders one camera under each light, with all maps. For several cameras or for the radiance alone see [`Renderer`].
     pub fn render(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
-        forward::render(self, camera, lights)
+        Renderer::new(self).renderings(camera, lights)
     }
 
     /// Number of Gaussians.

@@ -1,7 +1,12 @@
-//! The objective: every single-view term with its weight, value and gradient. A term of weight 0 is not computed.
+//! The objective: every single-view term with its weight, value and gradient, as far as [`crate::Needs`] wants it.
+//!
+//! Terms are computed on the region of the picture that is not empty. They are means over pixels, so that the mean over
+//! the picture is the mean over the region times the region's share of the pixels, plus, for the mask's cross-entropy,
+//! what an empty pixel costs there.
 use crate::forward::{PairGrad, View, ViewGrad};
+use crate::needs::StepNeeds;
 use crate::random::Random;
-use crate::{ActivatedGrad, Attribute, Config, Model, ReconstructError, StepPlan, TrainingPair, error};
+use crate::{ActivatedGrad, Attribute, Config, Model, ReconstructError, TrainingPair, error};
 use diamond_image::{Image, Transfer};
 use diamond_light::{OlatLight, spherical_harmonics::COEFFICIENTS};
 use diamond_losses::{Average, PhotometricOptions, Term};
@@ -54,6 +59,8 @@ pub struct Outcome {
     pub terms: Vec<TermValue>,
     /// PSNR in display sRGB, all pixels, dB.
     pub psnr: f32,
+    /// Whether both pictures were encoded once more for it.
+    pub psnr_encoded: bool,
 }
 
 fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
@@ -64,23 +71,27 @@ fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
 /// Identical pictures count as this many dB, as in `metrics.json`, so that means stay finite.
 const PSNR_CAP: f64 = 150.0;
 
-/// PSNR of two linear images in display sRGB, clamped, peak 1, dB; from the mean squared error where it is known.
-fn display_psnr(rendered: &Image, target: &Image, error: Option<f32>) -> Result<f32, ReconstructError> {
-    let psnr = match error {
-        Some(error) => -10.0 * f64::from(error).log10(),
-        None => {
-            let mut pair = [rendered, target].map(|image| diamond_losses::encode_image(Transfer::Srgb, image));
-            pair.iter_mut().flat_map(|image| image.data_mut()).for_each(|v| *v = v.clamp(0.0, 1.0));
-            diamond_metrics::psnr(&pair[0], &pair[1], 1.0).map_err(error::stage("PSNR"))?
-        }
-    };
-    Ok(psnr.min(PSNR_CAP) as f32)
+/// Mean squared error of two linear images in display sRGB, clamped.
+fn display_error(rendered: &Image, target: &Image) -> Result<f64, ReconstructError> {
+    let mut pair = [rendered, target].map(|image| diamond_losses::encode_image(Transfer::Srgb, image));
+    pair.iter_mut().flat_map(|image| image.data_mut()).for_each(|v| *v = v.clamp(0.0, 1.0));
+    diamond_metrics::mse(&pair[0], &pair[1]).map_err(error::stage("PSNR"))
+}
+
+/// PSNR with peak 1 of a mean squared error, dB.
+fn decibel(error: f64) -> f32 {
+    if error > 0.0 { (-10.0 * error.log10()).min(PSNR_CAP) as f32 } else { PSNR_CAP as f32 }
+}
+
+/// Cross-entropy of a pixel that neither the mask nor a Gaussian covers: not 0, since opacities are kept off 0.
+fn empty_pixel_entropy() -> f64 {
+    -(1.0 - diamond_losses::OPACITY_MARGIN).ln()
 }
 
 /// Value and gradient of every image term for one pair, with weight `share` in the batch.
 pub fn evaluate(
     config: &Config,
-    plan: &StepPlan,
+    needs: &StepNeeds,
     view: &View<'_>,
     pair: &TrainingPair<'_>,
     share: f32,
@@ -90,6 +101,14 @@ pub fn evaluate(
     let mut out = ViewGrad::default();
     let mut terms = Vec::with_capacity(10);
     let fail = error::stage("objective");
+    let fraction = view.region.fraction(pair.radiance.width(), pair.radiance.height());
+    let part = |value: f32| (fraction * f64::from(value)) as f32;
+    let target = view.region.crop(pair.radiance).map_err(error::stage("region"))?;
+    let mask = match pair.mask {
+        Some(mask) => Some(view.region.crop_mask(mask).map_err(error::stage("region"))?),
+        None => None,
+    };
+    let mask = mask.as_ref();
 
     let options = PhotometricOptions {
         lambda_ssim: loss.ssim,
@@ -97,25 +116,29 @@ pub fn evaluate(
         space: loss.space.transfer(),
         window: SsimWindow::ZeroPadded,
     };
-    let photometric =
-        diamond_losses::photometric(&shaded.radiance, pair.radiance, &options, pair.weight).map_err(&fail)?;
     let weight = pair.weight;
-    terms.push(TermValue { name: "l1", weight: weight * (1.0 - loss.ssim), value: photometric.l1 });
-    terms.push(TermValue { name: "dssim", weight: weight * loss.ssim, value: photometric.dssim });
-    if loss.l2 > 0.0 {
-        terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: photometric.l2 });
+    let photometric = diamond_losses::photometric(&shaded.radiance, &target, &options, weight).map_err(&fail)?;
+    terms.push(TermValue { name: "l1", weight: weight * (1.0 - loss.ssim), value: part(photometric.l1) });
+    if needs.window {
+        terms.push(TermValue { name: "dssim", weight: weight * loss.ssim, value: part(photometric.dssim) });
     }
-    add_scaled(&mut out.shaded.radiance, &photometric.grad, share);
+    if loss.l2 > 0.0 {
+        terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: part(photometric.l2) });
+    }
+    // Gradients of means over the region become those of means over the picture with the share of the batch.
+    let scale = part(share);
+    add_scaled(&mut out.shaded.radiance, &photometric.grad, scale);
 
     let mut push = |term: Term, weight: f32, value: f32| terms.push(TermValue { name: term.name(), weight, value });
-    if let (true, Some(mask)) = (loss.mask > 0.0, pair.mask) {
-        let l = diamond_losses::mask_bce(&view.raster.opacity, mask).map_err(&fail)?;
-        push(Term::Mask, loss.mask, l.value);
-        add_scaled(&mut out.opacity, &l.grad, share * loss.mask);
+    if let (true, Some(mask)) = (needs.mask, mask) {
+        let l = diamond_losses::mask_bce(view.opacity, mask).map_err(&fail)?;
+        let value = fraction * f64::from(l.value) + (1.0 - fraction) * empty_pixel_entropy();
+        push(Term::Mask, loss.mask, value as f32);
+        add_scaled(&mut out.opacity, &l.grad, scale * loss.mask);
     }
-    if loss.normal > 0.0 {
+    if needs.normal {
         let (pseudo, _) =
-            pseudo_normals(pair.camera, &maps.depth, &view.raster.opacity).map_err(error::stage("pseudo-normals"))?;
+            pseudo_normals(view.camera, &maps.depth, view.opacity).map_err(error::stage("pseudo-normals"))?;
         // Where the pseudo-normal is undefined the rendered normal takes its place and the difference is 0.
         let mut target = pseudo;
         for (t, n) in target.data_mut().chunks_exact_mut(3).zip(maps.normal.data().chunks_exact(3)) {
@@ -123,48 +146,65 @@ pub fn evaluate(
                 t.copy_from_slice(n);
             }
         }
-        let l =
-            diamond_losses::normal_consistency(&maps.normal, &target, pair.mask, Average::AllPixels).map_err(&fail)?;
-        push(Term::Normal, loss.normal, l.value);
-        add_scaled(&mut out.shaded.maps.normal, &l.grad, share * loss.normal);
+        let l = diamond_losses::normal_consistency(&maps.normal, &target, mask, Average::AllPixels).map_err(&fail)?;
+        push(Term::Normal, loss.normal, part(l.value));
+        add_scaled(&mut out.shaded.maps.normal, &l.grad, scale * loss.normal);
     }
-    let roughness = if plan.roughness_frozen { 0.0 } else { loss.smooth_roughness };
     let smooth = [
-        (Term::SmoothBaseColor, loss.smooth_base_color, &maps.base_color, &mut out.shaded.maps.base_color),
-        (Term::SmoothMetalness, loss.smooth_metalness, &maps.metalness, &mut out.shaded.maps.metalness),
-        (Term::SmoothRoughness, roughness, &maps.roughness, &mut out.shaded.maps.roughness),
+        (
+            Term::SmoothBaseColor,
+            (needs.smooth_base_color, loss.smooth_base_color),
+            &maps.base_color,
+            &mut out.shaded.maps.base_color,
+        ),
+        (
+            Term::SmoothMetalness,
+            (needs.smooth_metalness, loss.smooth_metalness),
+            &maps.metalness,
+            &mut out.shaded.maps.metalness,
+        ),
+        (
+            Term::SmoothRoughness,
+            (needs.smooth_roughness, loss.smooth_roughness),
+            &maps.roughness,
+            &mut out.shaded.maps.roughness,
+        ),
         (
             Term::SmoothSubsurfaceness,
-            loss.smooth_subsurfaceness,
+            (needs.smooth_subsurfaceness, loss.smooth_subsurfaceness),
             &maps.subsurfaceness,
             &mut out.shaded.maps.subsurfaceness,
         ),
     ];
-    let edges = match smooth.iter().any(|(_, weight, ..)| *weight > 0.0) {
-        true => Some(diamond_losses::EdgeWeights::new(pair.radiance, pair.mask).map_err(&fail)?),
+    let edges = match smooth.iter().any(|(_, (needed, _), ..)| *needed) {
+        true => Some(diamond_losses::EdgeWeights::new(&target, mask).map_err(&fail)?),
         false => None,
     };
-    for (term, weight, map, grad) in smooth {
-        if let (true, Some(edges)) = (weight > 0.0, &edges) {
+    for (term, (needed, weight), map, grad) in smooth {
+        if let (true, Some(edges)) = (needed, &edges) {
             let l = edges.smoothness(map).map_err(&fail)?;
-            push(term, weight, l.value);
-            add_scaled(grad, &l.grad, share * weight);
+            push(term, weight, part(l.value));
+            add_scaled(grad, &l.grad, scale * weight);
         }
     }
-    if loss.enhancement > 0.0 {
-        let l = diamond_losses::enhancement(&maps.base_color, pair.radiance, pair.mask, Average::AllPixels)
-            .map_err(&fail)?;
-        push(Term::Enhancement, loss.enhancement, l.value);
-        add_scaled(&mut out.shaded.maps.base_color, &l.grad, share * loss.enhancement);
+    if needs.enhancement {
+        let l = diamond_losses::enhancement(&maps.base_color, &target, mask, Average::AllPixels).map_err(&fail)?;
+        push(Term::Enhancement, loss.enhancement, part(l.value));
+        add_scaled(&mut out.shaded.maps.base_color, &l.grad, scale * loss.enhancement);
     }
-    if loss.incident > 0.0 && config.shading.incident == crate::IncidentVariant::Learned {
+    if needs.incident {
         let l = diamond_losses::incident_light(maps.incident.data(), maps.visibility.data()).map_err(&fail)?;
-        push(Term::Incident, loss.incident, l.value);
+        push(Term::Incident, loss.incident, part(l.value));
         let (w, h, _) = maps.incident.shape();
         let grad = Image::from_vec(w, h, 1, l.d_incident).map_err(error::stage("incident term"))?;
-        add_scaled(&mut out.shaded.maps.incident, &grad, share * loss.incident);
+        add_scaled(&mut out.shaded.maps.incident, &grad, scale * loss.incident);
     }
-    Ok(Outcome { grad: out, terms, psnr: display_psnr(&shaded.radiance, pair.radiance, photometric.display_error)? })
+    let known = photometric.display_error.filter(|_| !needs.own_psnr);
+    let error = match known {
+        Some(error) => f64::from(error),
+        None => display_error(&shaded.radiance, &target)?,
+    };
+    Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none() })
 }
 
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.
@@ -208,7 +248,7 @@ pub fn visibility_term(
 pub fn regularise(model: &Model, total: &mut ActivatedGrad, terms: &mut Terms) {
     let residual = &model.config.residual;
     let weight = residual.transfer_smoothness;
-    if weight <= 0.0 || !residual.transfer {
+    if !residual.transfer {
         return;
     }
     let values = model.parameters.values(Attribute::Transfer);

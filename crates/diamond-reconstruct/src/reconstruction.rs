@@ -1,8 +1,12 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
 use crate::pairs::PairOrder;
+use crate::region::Region;
 use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
-use crate::{Config, CpuEngine, Engine, Model, ReconstructError, Rendering, Scene, StepPlan, StepReport, TrainingPair};
+use crate::{
+    CaptureFacts, Config, CpuEngine, Engine, Model, Needs, ReconstructError, Rendering, Scene, StepPlan, StepReport,
+    TrainingPair,
+};
 use diamond_camera::Camera;
 use diamond_dataset::{Capture, Observation};
 use diamond_light::OlatLight;
@@ -14,7 +18,11 @@ pub struct Reconstruction {
     capture: Capture,
     config: Config,
     engine: Box<dyn Engine>,
+    needs: Needs,
+    facts: CaptureFacts,
     pairs: Vec<(usize, usize)>,
+    /// What of each pair's photograph and mask is not empty, once it was looked at.
+    contents: Vec<Option<Option<Region>>>,
     order: PairOrder,
     step: u64,
     /// Where the first Gaussians came from, for the log.
@@ -28,7 +36,14 @@ impl Reconstruction {
     /// Surveys the capture (its selected training part) and makes the model before the first step.
     pub fn new(capture: Capture, config: &Config) -> Result<Self, ReconstructError> {
         let (scene, points) = scene::survey(&capture, config)?;
-        Self::from_points(capture, config, scene, &points)
+        Self::from_points(capture, config, scene, &points, None)
+    }
+
+    /// As [`Reconstruction::new`] but with given decisions on what is computed, for instance
+    /// [`Needs::everything`], which leaves nothing out.
+    pub fn with_needs(capture: Capture, config: &Config, needs: Needs) -> Result<Self, ReconstructError> {
+        let (scene, points) = scene::survey(&capture, config)?;
+        Self::from_points(capture, config, scene, &points, Some(needs))
     }
 
     fn from_points(
@@ -36,6 +51,7 @@ impl Reconstruction {
         config: &Config,
         scene: Scene,
         points: &InitialPoints,
+        needs: Option<Needs>,
     ) -> Result<Self, ReconstructError> {
         let model = Model::initial(config, scene, points)?;
         let pairs: Vec<(usize, usize)> =
@@ -46,10 +62,15 @@ impl Reconstruction {
             });
         }
         let order = PairOrder::new(config.seed, pairs.len());
+        let facts = CaptureFacts::of(&capture)?;
+        let needs = needs.unwrap_or_else(|| Needs::decide(config, &facts));
         Ok(Self {
             capture,
             config: config.clone(),
-            engine: Box::new(CpuEngine::new(model)),
+            engine: Box::new(CpuEngine::with_needs(model, needs.clone())),
+            needs,
+            facts,
+            contents: vec![None; pairs.len()],
             pairs,
             order,
             step: 0,
@@ -80,7 +101,8 @@ impl Reconstruction {
             .map_err(|e| fail(format!("metadata `scene`: {e}")))?;
         let step: u64 = file.metadata_value(&path, "step")?;
         let origin: String = file.metadata_value(&path, "initial_origin")?;
-        let mut run = Self::from_points(capture, config, scene, &InitialPoints { origin, ..Default::default() })?;
+        let points = InitialPoints { origin, ..Default::default() };
+        let mut run = Self::from_points(capture, config, scene, &points, None)?;
         run.engine.restore(&path, file)?;
         run.step = step;
         Ok(run)
@@ -156,19 +178,37 @@ impl Reconstruction {
         self.engine.profile()
     }
 
+    /// How much work the steps so far were, and would have been without leaving anything out.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.engine.counters()
+    }
+
+    /// What is computed and what is not, and why.
+    pub fn needs(&self) -> &Needs {
+        &self.needs
+    }
+
+    /// What is known of the capture.
+    pub fn facts(&self) -> &CaptureFacts {
+        &self.facts
+    }
+
     /// One training step.
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
         let plan = StepPlan::new(&self.config, self.step);
         let batch = self.config.accumulate as u64;
-        let mut loaded: Vec<(usize, usize, Arc<Observation>)> = Vec::with_capacity(batch as usize);
+        let mut loaded: Vec<(usize, usize, Option<Region>, Arc<Observation>)> = Vec::with_capacity(batch as usize);
         for k in 0..batch {
-            let (v, s) = self.pairs[self.order.at(self.step * batch + k)];
-            let shot = &self.capture.train[v].shots[s];
-            loaded.push((v, s, self.capture.observation(shot)?));
+            let pair = self.order.at(self.step * batch + k);
+            let (v, s) = self.pairs[pair];
+            let observation = self.capture.observation(&self.capture.train[v].shots[s])?;
+            let look = || Region::of_photograph(&observation.radiance, observation.mask.as_ref());
+            let content = *self.contents[pair].get_or_insert_with(look);
+            loaded.push((v, s, content, observation));
         }
         let pairs: Vec<TrainingPair<'_>> = loaded
             .iter()
-            .map(|(v, s, observation)| {
+            .map(|(v, s, content, observation)| {
                 let view = &self.capture.train[*v];
                 TrainingPair {
                     camera: &view.camera,
@@ -176,6 +216,7 @@ impl Reconstruction {
                     radiance: &observation.radiance,
                     mask: observation.mask.as_ref(),
                     weight: view.shots[*s].weight,
+                    content: *content,
                 }
             })
             .collect();

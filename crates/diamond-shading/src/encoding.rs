@@ -32,6 +32,9 @@ pub const ENCODED_POSITION: usize = 6 * ENCODING_FREQUENCIES;
 /// Network inputs per row without a learned code.
 pub const RESIDUAL_INPUTS: usize = ENCODED_POSITION + 18;
 
+/// The columns that depend on the light: its direction, its visibility, its distance.
+pub const LIGHT_COLUMNS: [usize; 5] = [34, 35, 36, 40, 41];
+
 /// Half the side of a scene's box is at least this (scene units): guards the division of a flat or empty box.
 const MIN_HALF_EXTENT: f32 = 1e-6;
 
@@ -328,6 +331,23 @@ impl<'a> ResidualInputs<'a> {
             }
         });
         Ok((matrix, ResidualInputsPullback { inputs: *self, scaling: *scaling }))
+    }
+
+    /// The columns [`LIGHT_COLUMNS`] of [`ResidualInputs::assemble`]'s matrix, `[rows × 5]`.
+    ///
+    /// Errors: [`ShadingError::Shape`] if one of the light's arrays has another length than there are positions.
+    /// `[eq:residual-inputs]`
+    pub fn light_columns(&self, scaling: &InputScaling) -> Result<Vec<f32>, ShadingError> {
+        let rows = self.rows();
+        check_length("ResidualInputs::light_directions", rows, self.light_directions.len())?;
+        check_length("ResidualInputs::visibility", rows, self.visibility.len())?;
+        check_length("ResidualInputs::light_distances", rows, self.light_distances.len())?;
+        let mut columns = Vec::with_capacity(rows * LIGHT_COLUMNS.len());
+        for i in 0..rows {
+            columns.extend_from_slice(&self.light_directions[i].to_array());
+            columns.extend_from_slice(&[self.visibility[i], scaling.distance_input(self.light_distances[i])]);
+        }
+        Ok(columns)
     }
 
     fn write_row(&self, i: usize, sines: [[f32; 2]; 3], scaling: &InputScaling, row: &mut [f32]) {

@@ -67,8 +67,8 @@ pub use angles::{Angles, AnglesGrad, DirectionsGrad};
 pub use brdf::{BrdfModel, CosineFloor, Diffuse, ReflectGrad};
 pub use deferred::{Combine, IncidentModel, ShadePullback, ShadingConfig, SurfaceVisibility, shade};
 pub use encoding::{
-    ENCODED_POSITION, ENCODING_FREQUENCIES, InputGradients, InputScaling, LightDistanceInput, RESIDUAL_INPUTS,
-    ResidualInputs, ResidualInputsGrad, ResidualInputsPullback, ScaleInput, positional_encoding,
+    ENCODED_POSITION, ENCODING_FREQUENCIES, InputGradients, InputScaling, LIGHT_COLUMNS, LightDistanceInput,
+    RESIDUAL_INPUTS, ResidualInputs, ResidualInputsGrad, ResidualInputsPullback, ScaleInput, positional_encoding,
     positional_encoding_pull,
 };
 pub use error::ShadingError;
@@ -77,9 +77,11 @@ pub use gbuffer::{GBuffer, GBufferGrad, MIN_OPACITY, channel};
 pub use ggx::Masking;
 pub use material::{DIELECTRIC_F0, MIN_ROUGHNESS, Material, MaterialGrad};
 pub use mlp::{Activation, CHUNK_ROWS, GRADIENT_GROUPS, Mlp, MlpGrad, MlpPullback, MlpShape};
-pub use prepared::Prepared;
+pub use prepared::{Prepared, TransportChannels};
 pub use pseudo_normal::{MIN_COVERAGE, PseudoNormalPullback, pseudo_normals};
-pub use residual::{ResidualNetwork, ResidualNetworkConfig, ResidualNetworkGrad, ResidualOutput, ResidualPullback};
+pub use residual::{
+    ManyLights, ResidualNetwork, ResidualNetworkConfig, ResidualNetworkGrad, ResidualOutput, ResidualPullback,
+};
 pub use shaded::{Shaded, ShadedGrad, ShadedMaps, ShadedMapsGrad};
 pub use surface_point::{MIN_COS_THETA_O, MIN_NORMAL_LENGTH};
 pub use transfer::{TransferActivation, TransferConfig, TransferGrad, TransferPullback, transfer_radiance};

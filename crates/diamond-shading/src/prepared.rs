@@ -9,6 +9,7 @@ use crate::surface_point::{GEOMETRY, SurfacePoint, TRANSPORT, Transport};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
+use glam::Vec3;
 
 /// The light-independent half of a view, ready for any number of lights.
 ///
@@ -66,5 +67,57 @@ impl Prepared {
             }
         });
         Ok(unpack(&records))
+    }
+
+    /// The radiance alone under one light, with the bits of [`Prepared::shade`]. `transport` may hold the channels of
+    /// many lights; `channels` says where this light's are, and what is absent is 0.
+    ///
+    /// # Errors
+    /// [`ShadingError::Shape`] where `transport` has another size than the view or too few channels.
+    pub fn radiance(
+        &self,
+        light: &OlatLight,
+        transport: &Image,
+        channels: &TransportChannels,
+    ) -> Result<Image, ShadingError> {
+        let least = channels.end();
+        let enough = transport.channels().max(least);
+        check_image("Prepared::radiance: transport", transport, (self.width, self.height, enough))?;
+        let mut radiance = Image::new(self.width, self.height, 3);
+        map_chunks_mut(radiance.data_mut(), self.width * 3, |y, row| {
+            for (x, out) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                let Some((point, opacity, weight)) = &self.points[y * self.width + x] else { continue };
+                let pixel = transport.pixel(x, y);
+                let scalar = |c: Option<usize>| c.map_or(0.0, |c| pixel[c] * weight);
+                let residual = channels.residual.map_or(Vec3::ZERO, |c| Vec3::from_slice(&pixel[c..]) * *weight);
+                let transport = Transport {
+                    residual,
+                    incident: scalar(channels.incident),
+                    visibility: scalar(channels.visibility),
+                };
+                let lit = point.light(&transport, light, &self.config);
+                *out = (lit.surface * *opacity + lit.subsurface * *opacity).to_array();
+            }
+        });
+        Ok(radiance)
+    }
+}
+
+/// Where one light's channels lie among those of many; `None` where they were not rasterised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TransportChannels {
+    /// First of three.
+    pub residual: Option<usize>,
+    /// Learned incident light.
+    pub incident: Option<usize>,
+    /// Visibility.
+    pub visibility: Option<usize>,
+}
+
+impl TransportChannels {
+    /// One past the last channel.
+    fn end(&self) -> usize {
+        let last = self.residual.map(|c| c + 2).max(self.incident).max(self.visibility);
+        last.map_or(0, |c| c + 1)
     }
 }

@@ -5,7 +5,7 @@ use diamond_image::Image;
 use diamond_light::{Falloff, OlatLight};
 use diamond_shading::{
     BrdfModel, Combine, Diffuse, Fresnel, GBuffer, GBufferGrad, IncidentModel, MIN_COS_THETA_O, Masking, Prepared,
-    Shaded, ShadedGrad, ShadedMapsGrad, ShadingConfig, SurfaceVisibility, channel, shade,
+    Shaded, ShadedGrad, ShadedMapsGrad, ShadingConfig, SurfaceVisibility, TransportChannels, channel, shade,
 };
 use diamond_testkit::adjoint::{dot, worst, worst_relative};
 use diamond_testkit::deferred::{Incident, OUTPUTS, Setting};
@@ -329,6 +329,12 @@ proptest! {
         let nine = images[0].channels_range(channel::GEOMETRY);
         let prepared = Prepared::new(&GBuffer { features: &nine, ..gbuffer }, &camera, &config).expect("shapes agree");
         prop_assert_eq!(&prepared.shade(&light, Some(&transport)).expect("shapes agree"), &expected);
+        // The radiance alone, from channels among others: channels 9 to 13 of all fourteen.
+        let channels = TransportChannels { residual: Some(9), incident: Some(12), visibility: Some(13) };
+        let radiance = prepared.radiance(&light, &images[0], &channels).expect("shapes agree");
+        prop_assert_eq!(&radiance, &expected.radiance);
+        let beyond = TransportChannels { visibility: Some(14), ..channels };
+        prop_assert!(prepared.radiance(&light, &images[0], &beyond).is_err());
     }
 }
 

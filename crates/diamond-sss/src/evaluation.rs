@@ -8,7 +8,7 @@ use crate::{SssError, render_lights};
 use diamond_dataset::{Capture, to_display};
 use diamond_image::{Image, Mask};
 use diamond_metrics::{FlipOptions, SsimWindow, flip_ldr, psnr, psnr_masked, ssim};
-use diamond_reconstruct::Model;
+use diamond_reconstruct::{Model, Renderer};
 
 /// PSNR of identical images is infinite, which JSON cannot say and no mean survives; it is reported as this, dB. Two
 /// different 8-bit images of fewer than 3·10⁹ values are never as close.
@@ -72,13 +72,14 @@ pub(crate) fn evaluate_with(
 ) -> Result<Vec<ImageScore>, SssError> {
     let total = capture.test.iter().map(|v| v.shots.len()).sum();
     let mut scores = Vec::with_capacity(total);
+    let renderer = Renderer::new(model);
     for (v, view) in capture.test.iter().enumerate() {
         let lights: Vec<_> = view.shots.iter().map(|s| s.light).collect();
-        render_lights(model, &view.camera, &lights, |s, rendering| {
+        render_lights(&renderer, &view.camera, &lights, |s, picture| {
             let shot = &view.shots[s];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);
-            let bytes = to_display(&rendering.radiance);
+            let bytes = to_display(&picture);
             let as_image = |bytes: &[u8]| {
                 Image::from_vec(width, height, 3, bytes.iter().map(|b| f32::from(*b) / 255.0).collect())
                     .map_err(|e| SssError::Internal(e.to_string()))

@@ -6,7 +6,7 @@ mod reconstruct;
 use clap::Parser;
 use cli::{Cli, Command, RenderArguments};
 use diamond_reconstruct::{Config, InstructionChoice, PRESETS};
-use diamond_sss::{CameraChoice, LightChoice, RenderOptions, SssError};
+use diamond_sss::{CameraChoice, LightChoice, PlanOptions, RenderOptions, SssError};
 use progress::Counter;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -57,6 +57,14 @@ fn run(command: Command) -> Result<(), SssError> {
                 diamond_sss::render_folder(&render_options(arguments)?, &mut |done, all| counter.show(done, all))?;
             counter.finish();
             written.iter().for_each(|path| print(&format!("{}\n", path.display())));
+            Ok(())
+        }
+        Command::Plan { capture, preset, settings, views, lights, json } => {
+            let plan = diamond_sss::plan_capture(&PlanOptions { capture, preset, settings, views, lights })?;
+            match json {
+                true => print(&format!("{:#}\n", plan.to_json()?)),
+                false => print(&plan.to_string()),
+            }
             Ok(())
         }
         Command::Inspect { capture, output } if diamond_sss::is_splat_file(&capture) => {

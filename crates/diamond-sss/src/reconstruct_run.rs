@@ -4,7 +4,7 @@ use crate::evaluation::evaluate_with;
 use crate::output_file::write_json;
 use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
-use crate::{Metrics, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
+use crate::{Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
 use diamond_dataset::{Capture, Selection};
 use diamond_reconstruct::{Config, InitialSource, InstructionChoice, Reconstruction, StepReport};
 use serde::{Deserialize, Serialize};
@@ -129,12 +129,14 @@ struct Costs {
     seconds: f64,
     peak_bytes: Option<u64>,
     profile: Vec<(String, f64)>,
+    #[serde(default)]
+    counters: Vec<(String, u64)>,
 }
 
 const COSTS_FILE: &str = "costs.json";
 
 /// Files and folders that a run writes; `--force` removes these and nothing else.
-const RESULTS: [&str; 13] = [
+const RESULTS: [&str; 14] = [
     "model.ply",
     "config.toml",
     "scene.toml",
@@ -145,6 +147,7 @@ const RESULTS: [&str; 13] = [
     "log.csv",
     "profile.json",
     "run.json",
+    "needs.json",
     "checkpoint/state.safetensors",
     "checkpoint/costs.json",
     "images",
@@ -226,12 +229,16 @@ fn run(
     record.instruction_set = instruction_set.to_string();
     record.write(folder)?;
     events(Event::Note(format!("first Gaussians: {}", training.initial_origin)));
+    let plan = Plan::new(&config, training.facts().clone(), training.needs().clone());
+    write_json(&folder.join("needs.json"), &plan.to_json()?)?;
+    events(Event::Note(plan.summary()));
     events(Event::Started { done: training.steps_done(), steps: config.steps, images: training.pair_count() });
     let earlier = costs.clone();
     let spent = |training: &Reconstruction| Costs {
         seconds: earlier.seconds + begun.elapsed().as_secs_f64(),
         peak_bytes: peak_bytes().max(earlier.peak_bytes),
-        profile: add_profiles(&earlier.profile, &training.profile()),
+        profile: add_sums(&earlier.profile, &training.profile()),
+        counters: add_sums(&earlier.counters, &training.counters()),
     };
     let save = |training: &mut Reconstruction, log: &TrainingLog| -> Result<(), SssError> {
         log.write(&folder.join("log.csv"))?;
@@ -303,12 +310,12 @@ fn record_of(options: &ReconstructOptions, config: &Config, capture: &Capture, c
     }
 }
 
-fn add_profiles(earlier: &[(String, f64)], now: &[(&'static str, f64)]) -> Vec<(String, f64)> {
+fn add_sums<T: Copy + std::ops::AddAssign>(earlier: &[(String, T)], now: &[(&'static str, T)]) -> Vec<(String, T)> {
     let mut out = earlier.to_vec();
-    for (name, seconds) in now {
+    for (name, value) in now {
         match out.iter_mut().find(|(n, _)| n == name) {
-            Some((_, s)) => *s += seconds,
-            None => out.push(((*name).to_owned(), *seconds)),
+            Some((_, sum)) => *sum += *value,
+            None => out.push(((*name).to_owned(), *value)),
         }
     }
     out
@@ -318,8 +325,11 @@ fn write_profile(folder: &Path, steps: u64, costs: &Costs) -> Result<(), SssErro
     let in_steps: f64 = costs.profile.iter().map(|(_, s)| s).sum();
     let parts: serde_json::Map<String, serde_json::Value> =
         costs.profile.iter().map(|(name, s)| (name.clone(), (*s).into())).collect();
+    let counters: serde_json::Map<String, serde_json::Value> =
+        costs.counters.iter().map(|(name, n)| (name.clone(), (*n).into())).collect();
     let value = serde_json::json!({
         "seconds": parts,
+        "counters": counters,
         "seconds_in_steps": in_steps,
         "seconds_total": costs.seconds,
         "steps": steps,

@@ -25,6 +25,30 @@ pub struct Cli {
 pub enum Command {
     /// Make a relightable model from a capture: model, figures, report
     Reconstruct(ReconstructArguments),
+    /// Say what a reconstruction would compute, what it would leave out and why, what it would need; computes nothing
+    #[command(after_help = "Examples:
+  diamond plan capture
+  diamond plan capture --preset paper loss.mask=0 shading.metal=no
+  diamond plan capture --json")]
+    Plan {
+        /// The capture
+        capture: PathBuf,
+        /// resolved, sss-3dgs, paper, or a TOML file
+        #[arg(long, default_value = "resolved")]
+        preset: String,
+        /// Settings to change, such as loss.mask=0
+        #[arg(value_name = "KEY=VALUE")]
+        settings: Vec<String>,
+        /// Training views: a count, or indices such as 0,5,7 or 0-7
+        #[arg(long, default_value = "all")]
+        views: Selection,
+        /// Training lights: a count, or indices such as 0,5,7 or 0-7
+        #[arg(long, default_value = "all")]
+        lights: Selection,
+        /// As JSON
+        #[arg(long)]
+        json: bool,
+    },
     /// Measure a model on the held-out images of a capture; rewrites metrics.json
     #[command(after_help = "Example:\n  diamond evaluate out capture --save-images")]
     Evaluate {

@@ -6,7 +6,7 @@ use crate::{SssError, render_lights};
 use diamond_camera::Camera;
 use diamond_dataset::{farthest_points, light_direction};
 use diamond_light::OlatLight;
-use diamond_reconstruct::Model;
+use diamond_reconstruct::{Model, Renderer};
 use glam::Vec3;
 use serde_json::{Value, json};
 
@@ -30,11 +30,11 @@ pub fn light_control(model: &Model, camera: &Camera, rig: &[OlatLight]) -> Resul
         *camera
     };
     let mut lights = Vec::new();
-    render_lights(model, &camera, &chosen, |i, rendering| {
+    render_lights(&Renderer::new(model), &camera, &chosen, |i, picture| {
         let d = camera.pose.rotation * light_direction(&chosen[i], centre);
         lights.push(json!({
             "direction": [d.x, -d.y, -d.z],
-            "picture": data_uri(&encode_png_linear(&rendering.radiance)?),
+            "picture": data_uri(&encode_png_linear(&picture)?),
         }));
         Ok(())
     })?;

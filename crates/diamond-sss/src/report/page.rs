@@ -7,7 +7,7 @@ use crate::{Metrics, RunRecord, SssError, TrainingLog, render_lights, write_outp
 use diamond_dataset::{Capture, Shot, View};
 use diamond_image::Image;
 use diamond_metrics::{FlipOptions, flip_ldr};
-use diamond_reconstruct::Model;
+use diamond_reconstruct::{CaptureFacts, Model, Needs, Renderer};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -47,6 +47,7 @@ pub fn write_report(
     body += "</div></section>";
     body += &maps(model, view)?;
     facts(&mut body, metrics, record, model);
+    needs(&mut body, &Needs::decide(&model.config, &CaptureFacts::of(capture)?));
     let data = serde_json::to_string(&control).map_err(|e| SssError::Internal(e.to_string()))?;
     let title = capture.root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned());
     let page = format!(
@@ -131,9 +132,10 @@ fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool)
         "<section><h2>Photograph and render</h2><p>Some {kind}. The error map is FLIP: the difference that an observer \
          sees, black for none, pale yellow for 1.</p><div class=\"rows\">"
     );
+    let renderer = Renderer::new(model);
     for (view, shots) in spread(views) {
         let lights: Vec<_> = shots.iter().map(|s| s.light).collect();
-        render_lights(model, &view.camera, &lights, |i, rendering| {
+        render_lights(&renderer, &view.camera, &lights, |i, radiance| {
             let shot = shots[i];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);
@@ -141,7 +143,7 @@ fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool)
                 Image::from_vec(width, height, 3, bytes.iter().map(|b| f32::from(*b) / 255.0).collect())
                     .map_err(|e| SssError::Internal(e.to_string()))
             };
-            let render = diamond_dataset::to_display(&rendering.radiance);
+            let render = diamond_dataset::to_display(&radiance);
             let (a, b) = (image(&observation.display)?, image(&render)?);
             let flip = flip_ldr(&a, &b, FlipOptions::default())?;
             let psnr = diamond_metrics::psnr(&a, &b, 1.0)?.min(crate::PSNR_CAP);
@@ -155,7 +157,7 @@ fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool)
             out += &format!(
                 "<div class=\"row\">{}{}{}<p><b>{}</b><br>{seen}<br>{psnr:.2} dB<br>FLIP {:.4}</p></div>",
                 picture(encode_png_rgb(&observation.display, width, height)?, "photograph"),
-                picture(encode_png_linear(&rendering.radiance)?, "render"),
+                picture(encode_png_linear(&radiance)?, "render"),
                 picture(encode_png_rgb(&heat_bytes(&flip.map, 1.0), width, height)?, "FLIP"),
                 escape(&shot.name),
                 flip.mean
@@ -169,16 +171,35 @@ fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool)
 fn maps(model: &Model, view: &View) -> Result<String, SssError> {
     let mut out = format!("<section><h2>What {} is made of</h2><div class=\"maps\">", escape(&view.name));
     let lights: Vec<_> = view.shots.iter().take(1).map(|s| s.light).collect();
-    render_lights(model, &view.camera, &lights, |_, rendering| {
+    for rendering in model.render(&view.camera, &lights)? {
         for (name, remark, png) in map_pictures(&rendering)? {
             out += &format!(
                 "<figure><img alt=\"{name}\" src=\"{}\"><figcaption>{name} <span>{remark}</span></figcaption></figure>",
                 data_uri(&png)
             );
         }
-        Ok(())
-    })?;
+    }
     Ok(out + "</div></section>")
+}
+
+/// What was computed and what was not, with reasons.
+fn needs(out: &mut String, needs: &Needs) {
+    let skipped = needs.skipped().count();
+    out.push_str(&format!(
+        "<section><h2>What was computed</h2><p>{skipped} of {} things were left out, since this configuration and this \
+         capture do not need them. Counts of the work are in profile.json.</p><details><summary>All decisions</summary>\
+         <table class=\"facts\">",
+        needs.rows().len()
+    ));
+    for row in needs.rows() {
+        let (mark, saved) = match row.decision.needed {
+            true => ("computed", String::new()),
+            false => ("left out", format!("; saves {}", row.saves)),
+        };
+        let reason = escape(&row.decision.reason);
+        out.push_str(&format!("<tr><th>{}</th><td>{mark}: {reason}{saved}</td></tr>", row.name));
+    }
+    out.push_str("</table></details></section>");
 }
 
 fn facts(out: &mut String, metrics: &Metrics, record: &RunRecord, model: &Model) {

@@ -1,0 +1,327 @@
+//! Pictures of a model: what does not depend on the light is done once for all lights of a view, and what does not
+//! depend on the view once for all views.
+//!
+//! For a view: projection, blending of the light-independent channels, the rectangle that is covered, the shader's half,
+//! the sums of the network's first layer, and which Gaussians pass anything to a pixel at all (those behind others do
+//! not). For a light remain: rays from those Gaussians, the rest of the network, three to five channels in a
+//! rasterisation that sixteen lights share, and the shader's other half on covered pixels.
+//!
+//! A picture has the same bits however many lights it is rendered among.
+use crate::channel_layout::ChannelLayout;
+use crate::forward::{Settings, raster_config};
+use crate::needs::RenderNeeds;
+use crate::region::Region;
+use crate::rows::{
+    LightRows, Rows, Transported, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
+};
+use crate::visibility_cache::Tracer;
+use crate::{Activated, CaptureFacts, Model, Needs, ReconstructError, Rendering, error};
+use diamond_camera::Camera;
+use diamond_image::Image;
+use diamond_light::OlatLight;
+use diamond_shading::{
+    GBuffer, ManyLights, Prepared, Shaded, ShadedMaps, TransportChannels, channel, transfer_radiance,
+};
+use diamond_splat::{Features, Projection, Raster, RasterGrad, project, rasterize_projected};
+use rayon::prelude::*;
+use std::sync::OnceLock;
+
+/// Lights whose residuals are blended in one rasterisation: bounds the memory of their channels.
+const LIGHTS_PER_RASTERISATION: usize = 16;
+/// From so many lights on it pays to find out which Gaussians pass something to a pixel: it costs about as much as one
+/// light, and spares each light the others.
+const LIGHTS_TO_LOOK_AHEAD: usize = 4;
+
+/// A model ready to be rendered from any number of views.
+pub struct Renderer<'m> {
+    model: &'m Model,
+    activated: Activated,
+    needs: RenderNeeds,
+    /// Built when the first light needs it.
+    tracer: OnceLock<Tracer>,
+}
+
+/// How much work a view was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RenderWork {
+    /// Gaussians in the view.
+    pub visible: usize,
+    /// Gaussians whose residual and visibility were computed, per light.
+    pub rows: usize,
+    /// Channels rasterised once.
+    pub fixed_channels: usize,
+    /// Channels rasterised per light.
+    pub light_channels: usize,
+    /// Pixels of the picture.
+    pub pixels: usize,
+    /// Pixels of the rectangle that was shaded.
+    pub shaded: usize,
+}
+
+impl<'m> Renderer<'m> {
+    /// Of a model as it stands.
+    pub fn new(model: &'m Model) -> Self {
+        let activated = model.parameters.activate();
+        let needs = Needs::decide(&model.config, &CaptureFacts::default()).rendering(&activated);
+        Self { model, activated, needs, tracer: OnceLock::new() }
+    }
+
+    /// Of a model with given decisions on what is computed.
+    pub fn with_needs(model: &'m Model, needs: RenderNeeds) -> Self {
+        Self { model, activated: model.parameters.activate(), needs, tracer: OnceLock::new() }
+    }
+
+    /// What is computed, and why.
+    pub fn needs(&self) -> &RenderNeeds {
+        &self.needs
+    }
+
+    /// The radiance of one view under each light: linear RGB over black.
+    pub fn radiance(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Image>, ReconstructError> {
+        let (mut out, layout) = (Vec::with_capacity(lights.len()), self.needs.layout());
+        self.each_group(camera, lights, &layout, &mut |view, lights, transport| {
+            let (width, height) = view.size;
+            let per_light = view.per_light.count();
+            let images = lights.par_iter().enumerate().map(|(k, light)| {
+                let at = |c: usize| view.per_light.place(c).map(|p| k * per_light + p);
+                let channels = TransportChannels {
+                    residual: at(channel::RESIDUAL.start),
+                    incident: at(channel::INCIDENT),
+                    visibility: at(channel::VISIBILITY),
+                };
+                let light = self.model.scene.scaled_light(light);
+                let part = view.prepared.radiance(&light, transport, &channels).map_err(error::stage("shade"))?;
+                Ok(view.region.paste(&part, width, height))
+            });
+            out.extend(images.collect::<Result<Vec<_>, ReconstructError>>()?);
+            Ok(())
+        })?;
+        Ok(out)
+    }
+
+    /// As [`Renderer::radiance`], with both parts of the light and all maps.
+    pub fn renderings(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
+        // The maps show every channel, whether or not the radiance depends on it.
+        let (mut out, layout) = (Vec::with_capacity(lights.len()), ChannelLayout::full());
+        self.each_group(camera, lights, &layout, &mut |view, lights, transport| {
+            let (width, height) = view.size;
+            let per_light = view.per_light.count();
+            for (k, light) in lights.iter().enumerate() {
+                let transport = transport.channels_range(k * per_light..(k + 1) * per_light);
+                let light = self.model.scene.scaled_light(light);
+                let shaded = view.prepared.shade(&light, Some(&transport)).map_err(error::stage("shade"))?;
+                out.push(rendering(shaded, &view.region, &view.opacity, width, height));
+            }
+            Ok(())
+        })?;
+        Ok(out)
+    }
+
+    /// How much work [`Renderer::radiance`] of one view under so many lights is.
+    pub fn work(&self, camera: &Camera, lights: usize) -> Result<RenderWork, ReconstructError> {
+        let layout = self.needs.layout();
+        let view = self.view(camera, lights, &layout)?;
+        Ok(RenderWork {
+            visible: view.projection.visible().len(),
+            rows: view.rows.len(),
+            fixed_channels: layout.count() - view.per_light.count(),
+            light_channels: view.per_light.count(),
+            pixels: view.size.0 * view.size.1,
+            shaded: view.region.pixels(),
+        })
+    }
+
+    fn tracer(&self) -> Result<&Tracer, ReconstructError> {
+        if let Some(tracer) = self.tracer.get() {
+            return Ok(tracer);
+        }
+        let tracer = Tracer::new(&self.activated.gaussians)?;
+        Ok(self.tracer.get_or_init(|| tracer))
+    }
+
+    /// The light-independent half of a view that will be rendered under `lights` lights.
+    fn view(&self, camera: &Camera, lights: usize, layout: &ChannelLayout) -> Result<ViewHalf, ReconstructError> {
+        let (model, gaussians) = (self.model, &self.activated.gaussians);
+        let projection = project(gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
+        let visible = projection.visible();
+        let fixed = layout.filtered(|c| channel::GEOMETRY.contains(&c));
+        let features = geometry_features(&self.activated, visible, &fixed);
+        let (raster, pullback) =
+            rasterize_projected(&projection, gaussians, &features).map_err(error::stage("rasterize"))?;
+        let (width, height, _) = raster.opacity.shape();
+        let rows = if lights >= LIGHTS_TO_LOOK_AHEAD && !self.needs.hidden_rows.needed {
+            // The gradient of Σ w·f with respect to f is Σ w: 0 for Gaussians that no pixel takes anything of.
+            let mut d = RasterGrad::zeros(width, height, fixed.count());
+            d.features.data_mut().iter_mut().step_by(fixed.count()).for_each(|v| *v = 1.0);
+            let pulled = pullback.pull(&d).map_err(error::stage("rasterize.pull"))?;
+            let passes = |&&i: &&u32| pulled.features[i as usize * fixed.count()] != 0.0;
+            visible.iter().filter(passes).copied().collect()
+        } else {
+            visible.to_vec()
+        };
+        let rows = Rows::new(model, &self.activated, camera, &rows);
+        let network = match &model.network {
+            Some(network) if self.needs.subsurface.needed || self.needs.incident.needed => {
+                let dark = LightRows::dark(rows.len());
+                let inputs = residual_inputs(model, &rows, &dark);
+                let (matrix, _) = inputs.assemble(&input_scaling(model)).map_err(error::stage("residual inputs"))?;
+                Some(network.many_lights(&matrix, rows.len()).map_err(error::stage("residual network"))?)
+            }
+            _ => None,
+        };
+        let region = match Region::of_image(&raster.opacity) {
+            Some(region) if !self.needs.empty_pixels.needed => region,
+            _ => Region::whole(width, height),
+        };
+        let (prepared, opacity) = self.prepare(&raster, &fixed, &region, camera)?;
+        Ok(ViewHalf {
+            per_light: layout.filtered(|c| channel::TRANSPORT.contains(&c)),
+            size: (width, height),
+            projection,
+            rows,
+            network,
+            region,
+            prepared,
+            opacity,
+        })
+    }
+
+    fn prepare(
+        &self,
+        raster: &Raster,
+        fixed: &ChannelLayout,
+        region: &Region,
+        camera: &Camera,
+    ) -> Result<(Prepared, Image), ReconstructError> {
+        let cropped = |image: &Image| region.crop(image).map_err(error::stage("region"));
+        let (opacity, depth) = (cropped(&raster.opacity)?, cropped(&raster.depth)?);
+        let features = fixed.unpack(&raster.features, region);
+        let gbuffer = GBuffer { features: &features, opacity: &opacity, depth: &depth };
+        let mut settings = Settings::rendering(self.model);
+        settings.shading.use_residual &= self.needs.subsurface.needed;
+        let prepared =
+            Prepared::new(&gbuffer, &region.camera(camera), &settings.shading).map_err(error::stage("shade"))?;
+        Ok((prepared, opacity))
+    }
+
+    /// Calls `shade` with the light-dependent channels of each group of lights, cut to the view's rectangle.
+    fn each_group(
+        &self,
+        camera: &Camera,
+        lights: &[OlatLight],
+        layout: &ChannelLayout,
+        shade: &mut dyn FnMut(&ViewHalf, &[OlatLight], &Image) -> Result<(), ReconstructError>,
+    ) -> Result<(), ReconstructError> {
+        if lights.is_empty() {
+            return Ok(());
+        }
+        let view = self.view(camera, lights.len(), layout)?;
+        let gaussians = &self.activated.gaussians;
+        let per_light = view.per_light.count();
+        for group in lights.chunks(LIGHTS_PER_RASTERISATION) {
+            let computed: Vec<Lit> =
+                group.par_iter().map(|light| self.light(&view, light, layout)).collect::<Result<_, _>>()?;
+            let mut features = Features::zeros(gaussians.len(), per_light * group.len());
+            for (k, lit) in computed.iter().enumerate() {
+                lit.transported().write(&mut features, per_light * k, &view.rows.visible, &view.per_light);
+            }
+            let (raster, _) =
+                rasterize_projected(&view.projection, gaussians, &features).map_err(error::stage("rasterize"))?;
+            let transport = view.region.crop(&raster.features).map_err(error::stage("region"))?;
+            shade(&view, group, &transport)?;
+        }
+        Ok(())
+    }
+
+    /// What one light adds to the rows of a view.
+    fn light(&self, view: &ViewHalf, light: &OlatLight, layout: &ChannelLayout) -> Result<Lit, ReconstructError> {
+        let (model, rows) = (self.model, &view.rows);
+        let traced;
+        let read = self.needs.visibility.needed || layout.place(channel::VISIBILITY).is_some();
+        let source = match model.config.visibility.traced {
+            _ if !read => VisibilitySource::Unread,
+            true => {
+                traced = self.tracer()?.trace_rows(
+                    &self.activated.gaussians,
+                    &self.activated.normals,
+                    light,
+                    &rows.visible,
+                )?;
+                VisibilitySource::TracedRows(&traced)
+            }
+            false => VisibilitySource::Fitted,
+        };
+        let lit = LightRows::new(model, rows, light, source)?;
+        let network = match &view.network {
+            Some(network) => {
+                let inputs = residual_inputs(model, rows, &lit);
+                let columns = inputs.light_columns(&input_scaling(model)).map_err(error::stage("residual inputs"))?;
+                Some(network.forward(&columns).map_err(error::stage("residual network"))?)
+            }
+            None => None,
+        };
+        let transfer = match transfer_config(model).filter(|_| self.needs.subsurface.needed) {
+            Some(config) => Some(
+                transfer_radiance(&rows.transfer, &lit.directions, config).map_err(error::stage("transfer vectors"))?.0,
+            ),
+            None => None,
+        };
+        Ok(Lit { network: network.map(|o| (o.residual, o.incident)), transfer, visibility: lit.visibility })
+    }
+}
+
+/// The light-independent half of a view.
+struct ViewHalf {
+    /// The light-dependent channels of one light.
+    per_light: ChannelLayout,
+    /// Width and height.
+    size: (usize, usize),
+    projection: Projection,
+    /// Of the Gaussians that pass something to a pixel.
+    rows: Rows,
+    network: Option<ManyLights>,
+    /// Outside of it no Gaussian covers anything.
+    region: Region,
+    prepared: Prepared,
+    /// Of the region.
+    opacity: Image,
+}
+
+/// What one light adds, row by row.
+struct Lit {
+    network: Option<(Vec<f32>, Vec<f32>)>,
+    transfer: Option<Vec<f32>>,
+    visibility: Vec<f32>,
+}
+
+impl Lit {
+    fn transported(&self) -> Transported<'_> {
+        Transported {
+            network: self.network.as_ref().map(|(residual, incident)| (residual.as_slice(), incident.as_slice())),
+            transfer: self.transfer.as_deref(),
+            visibility: &self.visibility,
+        }
+    }
+}
+
+fn rendering(shaded: Shaded, region: &Region, opacity: &Image, width: usize, height: usize) -> Rendering {
+    let whole = |part: &Image| region.paste(part, width, height);
+    let m = &shaded.maps;
+    Rendering {
+        radiance: whole(&shaded.radiance),
+        surface: whole(&shaded.surface),
+        subsurface: whole(&shaded.subsurface),
+        opacity: whole(opacity),
+        maps: ShadedMaps {
+            base_color: whole(&m.base_color),
+            roughness: whole(&m.roughness),
+            metalness: whole(&m.metalness),
+            subsurfaceness: whole(&m.subsurfaceness),
+            normal: whole(&m.normal),
+            residual: whole(&m.residual),
+            incident: whole(&m.incident),
+            visibility: whole(&m.visibility),
+            depth: whole(&m.depth),
+        },
+    }
+}
