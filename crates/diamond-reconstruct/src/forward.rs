@@ -281,24 +281,41 @@ pub fn value_and_grad(
                     || (has_incident && d_incident[row] != 0.0)
             })
             .collect();
-        backward_rows = live.len();
-        let take = |values: &[f32], width: usize| -> Vec<f32> {
-            live.iter().flat_map(|&row| &values[row * width..(row + 1) * width]).copied().collect()
-        };
         let width = network.inputs();
-        let (matrix, d_live) = (take(matrix, width), take(&d_residual, 3));
-        let d_live_incident = if has_incident { take(&d_incident, 1) } else { Vec::new() };
-        let mut grad = network
-            .pullback(&matrix, live.len())
-            .and_then(|pullback| pullback.pull(&d_live, &d_live_incident, needs.input_gradient))
-            .map_err(error::stage("residual network.pull"))?;
+        let incident: &[f32] = if has_incident { &d_incident } else { &[] };
+        let d = if 16 * live.len() > 15 * rows.len() {
+            // So few are hidden that leaving them out would cost more than it saves.
+            backward_rows = rows.len();
+            let pullback = network.pullback(matrix, rows.len());
+            pullback.and_then(|pullback| pullback.pull(&d_residual, incident, needs.input_gradient))
+        } else {
+            backward_rows = live.len();
+            let take = |values: &[f32], width: usize| -> Vec<f32> {
+                let mut taken = Vec::with_capacity(live.len() * width);
+                live.iter().for_each(|&row| taken.extend_from_slice(&values[row * width..(row + 1) * width]));
+                taken
+            };
+            let (matrix, d_live) = (take(matrix, width), take(&d_residual, 3));
+            let d_live_incident = if has_incident { take(&d_incident, 1) } else { Vec::new() };
+            let pullback = network.pullback(&matrix, live.len());
+            pullback.and_then(|pullback| pullback.pull(&d_live, &d_live_incident, needs.input_gradient)).map(
+                |mut grad| {
+                    grad.inputs = grad.inputs.take().map(|d_inputs| {
+                        let mut all = vec![0.0; rows.len() * width];
+                        for (&row, d) in live.iter().zip(d_inputs.chunks_exact(width)) {
+                            all[row * width..(row + 1) * width].copy_from_slice(d);
+                        }
+                        all
+                    });
+                    grad
+                },
+            )
+        };
+        let mut grad = d.map_err(error::stage("residual network.pull"))?;
         if let Some(d_inputs) = grad.inputs.take() {
-            let mut all = vec![0.0; rows.len() * width];
-            for (&row, d) in live.iter().zip(d_inputs.chunks_exact(width)) {
-                all[row * width..(row + 1) * width].copy_from_slice(d);
-            }
-            let d =
-                inputs_pullback.pull(&all, InputGradients::Learned).map_err(error::stage("residual inputs.pull"))?;
+            let d = inputs_pullback
+                .pull(&d_inputs, InputGradients::Learned)
+                .map_err(error::stage("residual inputs.pull"))?;
             out.codes = vec![0.0; n * codes];
             for (row, &i) in rows.visible.iter().enumerate() {
                 let i = i as usize;

@@ -200,7 +200,7 @@ fn decisions_say_why() {
 #[test]
 fn hidden_gaussians_are_not_pulled() {
     let mut config = short("resolved");
-    (config.initial.count, config.initial.opacity) = (1500, 0.99);
+    (config.initial.count, config.initial.opacity) = (6000, 0.99);
     let mut skipping = Reconstruction::new(capture(), &config).expect("starts");
     let mut everything = Reconstruction::with_needs(capture(), &config, Needs::everything()).expect("starts");
     assert!(skipping.step().is_ok() && everything.step().is_ok());
