@@ -110,11 +110,6 @@ pub fn exponent(points: &[(f64, f64)]) -> f64 {
     xy / xx
 }
 
-/// Lets the peak of resident memory begin anew at what is resident now (Linux; elsewhere nothing happens).
-pub fn reset_peak_memory() {
-    let _ = std::fs::write("/proc/self/clear_refs", "5");
-}
-
 /// Peak and present resident memory in MB, where the system says.
 pub fn memory() -> Option<(f64, f64)> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

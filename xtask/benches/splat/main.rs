@@ -14,7 +14,7 @@ use std::hint::black_box;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
-use xtask::bench::{Table, exponent, median, memory, reset_peak_memory, time};
+use xtask::bench::{Table, exponent, median, memory, time};
 
 /// Wall milliseconds of OpenSplat 1.2 on two threads of an idle Zen 4 server, forward and forward + backward, in the
 /// order of [`scene::EIGHT`]: another machine, hence a comparison of orders of magnitude only.
@@ -35,6 +35,9 @@ struct Arguments {
     /// Threads.
     #[arg(long, default_value_t = 2)]
     threads: usize,
+    /// Repeats at least.
+    #[arg(long, default_value_t = 7)]
+    least: usize,
     /// Seconds of repeats per scene and direction.
     #[arg(long, default_value_t = 1.5)]
     seconds: f64,
@@ -47,9 +50,28 @@ struct Arguments {
     /// Folder of the CSV and JSON files.
     #[arg(long, default_value = "out/bench")]
     out: PathBuf,
+    /// One forward and backward pass of so many Gaussians, side, channels; prints the peak of resident memory, MB.
+    #[arg(long, hide = true, value_delimiter = ',')]
+    peak_of: Vec<usize>,
     /// Given by `cargo bench`; without meaning.
     #[arg(long, hide = true)]
     bench: bool,
+}
+
+impl Arguments {
+    /// The same with less time for each scene.
+    fn short(&self) -> Self {
+        let (only, out, peak_of) = (self.only.clone(), self.out.clone(), Vec::new());
+        Self { seconds: 0.3 * self.seconds, only, out, peak_of, ..*self }
+    }
+}
+
+/// Peak of resident memory, MB, of a process of its own that renders once forward and backward.
+fn peak_of(gaussians: usize, side: usize, channels: usize, threads: usize) -> Option<f64> {
+    let of = format!("{gaussians},{side},{channels}");
+    let arguments = ["--peak-of", &of, "--threads", &threads.to_string()].map(str::to_owned);
+    let out = std::process::Command::new(std::env::current_exe().ok()?).args(arguments).output().ok()?;
+    String::from_utf8_lossy(&out.stdout).trim().parse().ok()
 }
 
 fn main() -> ExitCode {
@@ -65,6 +87,12 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<(), String> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(arguments.threads).build().map_err(|e| e.to_string())?;
     pool.install(|| {
+        if let [gaussians, side, channels] = arguments.peak_of[..] {
+            let scene = BenchScene::new(gaussians, side as u32, channels, scene::DENSE);
+            measure(&scene, &Arguments { seconds: 0.0, least: 1, ..arguments.short() })?;
+            println!("{}", memory().map_or(f64::NAN, |(peak, _)| peak));
+            return Ok(());
+        }
         eight(arguments)?;
         if arguments.only.is_none() && !arguments.forward_only { growth(arguments) } else { Ok(()) }
     })
@@ -81,13 +109,13 @@ fn measure(scene: &BenchScene, arguments: &Arguments) -> Result<[Vec<f64>; 2], S
     }
     let forward = || rasterize(gaussians, features, &scene.camera, &scene.config);
     forward().map_err(|e| e.to_string())?.1.pull(&d).map_err(|e| e.to_string())?;
-    let one = time(budget, 7, || {
+    let one = time(budget, arguments.least, || {
         let _ = black_box(forward());
     });
     if arguments.forward_only {
         return Ok([one.clone(), one]);
     }
-    let both = time(budget, 7, || {
+    let both = time(budget, arguments.least, || {
         if let Ok((raster, pullback)) = forward() {
             let _ = black_box((raster, pullback.pull(&d)));
         }
@@ -164,9 +192,11 @@ fn eight(arguments: &Arguments) -> Result<(), String> {
 
 fn growth(arguments: &Arguments) -> Result<(), String> {
     let context = [("threads", arguments.threads.to_string()), ("seed", scene::SEED.to_string())];
-    let columns = ["of", "value", "forward ms", "both ms", "peak MB above before"];
+    let columns = ["of", "value", "forward ms", "both ms", "peak MB (process of its own, scene included)"];
     let mut table = Table::new("splat-growth", &columns, &context);
-    let short = Arguments { seconds: 0.3 * arguments.seconds, only: None, out: arguments.out.clone(), ..*arguments };
+    let short = arguments.short();
+    // What a process takes that renders next to nothing.
+    let base = peak_of(1, 8, 1, arguments.threads);
     let mut exponents = Vec::new();
     let axes: [(&str, &[usize]); 3] = [
         ("Gaussians", &[4_000, 16_000, 64_000, 256_000]),
@@ -176,15 +206,14 @@ fn growth(arguments: &Arguments) -> Result<(), String> {
     for (axis, values) in axes {
         let mut points = [Vec::new(), Vec::new(), Vec::new()];
         for &value in values {
-            let scene = match axis {
-                "Gaussians" => BenchScene::new(value, 512, 3, scene::DENSE),
-                "pixels" => BenchScene::new(20_000, (value as f64).sqrt() as u32, 3, scene::DENSE),
-                _ => BenchScene::new(20_000, 256, value, scene::DENSE),
+            let (gaussians, side, channels) = match axis {
+                "Gaussians" => (value, 512, 3),
+                "pixels" => (20_000, (value as f64).sqrt() as usize, 3),
+                _ => (20_000, 256, value),
             };
-            reset_peak_memory();
-            let before = memory();
+            let scene = BenchScene::new(gaussians, side as u32, channels, scene::DENSE);
             let [forward, both] = measure(&scene, &short)?;
-            let peak = before.zip(memory()).map(|((_, now), (peak, _))| peak - now);
+            let peak = base.zip(peak_of(gaussians, side, channels, arguments.threads)).map(|(base, peak)| peak - base);
             let x = value as f64;
             points[0].push((x, median(&forward)));
             points[1].push((x, median(&both)));
