@@ -92,6 +92,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         scales: vec![Vec3::splat(0.3), Vec3::new(0.4, 0.1, 0.1), Vec3::splat(0.2)],
         rotations: vec![Quat::IDENTITY; 3],
         opacities: vec![0.9; 3],
+        ..Default::default()
     };
     let mut features = Features::zeros(3, 1);
     (0..3).for_each(|i| features.row_mut(i)[0] = 1.0);
