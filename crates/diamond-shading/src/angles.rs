@@ -4,6 +4,8 @@
 //! between them, an isotropic microfacet BRDF depends on n·l, n·v, v·h and the angle between n and h only. For a
 //! smooth surface the last one must be known to a small fraction of a small angle: 1 − (n·h)² has lost it in `f32`, so
 //! it is kept as sin² = |n×h|², and the few operations up to here run in `f64`.
+use crate::number::{Number, PerLane};
+use crate::vector::Vector;
 use glam::{DVec3, Vec3};
 
 /// Where |v + l| is smaller, v and l are opposite to within rounding and no half vector exists (both are unit vectors).
@@ -47,11 +49,113 @@ pub struct DirectionsGrad {
     pub light: Vec3,
 }
 
-/// Half vector and |v + l|; `None` where v = −l.
-fn half_vector(v: DVec3, l: DVec3) -> Option<(DVec3, f64)> {
+/// [`Angles`], or [`AnglesGrad`], of one pixel or many.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AnglesOf<T> {
+    pub cos_theta_i: T,
+    pub cos_theta_o: T,
+    pub cos_theta_d: T,
+    pub sin2_theta_h: T,
+}
+
+/// [`DirectionsGrad`] of one pixel or many.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct DirectionsGradOf<T> {
+    pub normal: Vector<T>,
+    pub view: Vector<T>,
+    pub light: Vector<T>,
+}
+
+#[inline(always)]
+fn widen(x: f32, y: f32, z: f32) -> DVec3 {
+    DVec3::new(f64::from(x), f64::from(y), f64::from(z))
+}
+
+/// Half vector and 1/|v + l|; both 0 where v = −l.
+#[inline(always)]
+fn half_vector(v: DVec3, l: DVec3) -> (DVec3, f64) {
     let sum = v + l;
-    let length = sum.length();
-    (length >= MIN_HALF_LENGTH).then(|| (sum / length, length))
+    let length = sum.dot(sum).sqrt();
+    let inverse = if length >= MIN_HALF_LENGTH { 1.0 / length } else { 0.0 };
+    (sum * inverse, inverse)
+}
+
+/// n, v, l → the four angles.
+struct Values;
+
+impl PerLane<9, 4> for Values {
+    #[inline(always)]
+    fn at(&self, x: [f32; 9]) -> [f32; 4] {
+        let (n, v, l) = (widen(x[0], x[1], x[2]), widen(x[3], x[4], x[5]), widen(x[6], x[7], x[8]));
+        let (h, inverse) = half_vector(v, l);
+        let cross = n.cross(h);
+        let sin2 = cross.dot(cross);
+        let sin2 = if sin2 < 1.0 && inverse > 0.0 { sin2 } else { 1.0 };
+        [n.dot(l) as f32, n.dot(v) as f32, v.dot(h) as f32, sin2 as f32]
+    }
+}
+
+/// n, v, l and the cotangents of the four angles → those of n, v, l.
+struct Pullback;
+
+impl PerLane<13, 9> for Pullback {
+    #[inline(always)]
+    fn at(&self, x: [f32; 13]) -> [f32; 9] {
+        let (n, v, l) = (widen(x[0], x[1], x[2]), widen(x[3], x[4], x[5]), widen(x[6], x[7], x[8]));
+        let (d_i, d_o, d_d, d_s) = (f64::from(x[9]), f64::from(x[10]), f64::from(x[11]), f64::from(x[12]));
+        // Without a half vector, h and the inverse length are 0, and so is what comes by way of them.
+        let (h, inverse) = half_vector(v, l);
+        let d_cross = n.cross(h) * (2.0 * d_s);
+        let d_h = d_cross.cross(n) + v * d_d;
+        let d_sum = (d_h - h * h.dot(d_h)) * inverse;
+        let d_n = l * d_i + v * d_o + h.cross(d_cross);
+        let d_v = n * d_o + h * d_d + d_sum;
+        let d_l = n * d_i + d_sum;
+        let narrow = [d_n.x, d_n.y, d_n.z, d_v.x, d_v.y, d_v.z, d_l.x, d_l.y, d_l.z];
+        let mut out = [0.0; 9];
+        for i in 0..9 {
+            out[i] = narrow[i] as f32;
+        }
+        out
+    }
+}
+
+impl<T: Number> AnglesOf<T> {
+    /// [`Angles::new`] of one pixel or many.
+    #[inline(always)]
+    pub fn new(n: Vector<T>, v: Vector<T>, l: Vector<T>) -> Self {
+        let x = [n.x, n.y, n.z, v.x, v.y, v.z, l.x, l.y, l.z];
+        let [cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h] = T::per_lane(&Values, x);
+        Self { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h }
+    }
+
+    /// [`Angles::pull`] of one pixel or many.
+    #[inline(always)]
+    pub fn pull(n: Vector<T>, v: Vector<T>, l: Vector<T>, d: &Self) -> DirectionsGradOf<T> {
+        let (i, o) = (d.cos_theta_i, d.cos_theta_o);
+        let x = [n.x, n.y, n.z, v.x, v.y, v.z, l.x, l.y, l.z, i, o, d.cos_theta_d, d.sin2_theta_h];
+        let d = T::per_lane(&Pullback, x);
+        DirectionsGradOf {
+            normal: Vector::new(d[0], d[1], d[2]),
+            view: Vector::new(d[3], d[4], d[5]),
+            light: Vector::new(d[6], d[7], d[8]),
+        }
+    }
+}
+
+impl From<&Angles> for AnglesOf<f32> {
+    #[inline(always)]
+    fn from(a: &Angles) -> Self {
+        let Angles { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h } = *a;
+        Self { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h }
+    }
+}
+
+impl From<DirectionsGradOf<f32>> for DirectionsGrad {
+    #[inline(always)]
+    fn from(d: DirectionsGradOf<f32>) -> Self {
+        Self { normal: d.normal.into(), view: d.view.into(), light: d.light.into() }
+    }
 }
 
 impl Angles {
@@ -59,32 +163,17 @@ impl Angles {
     /// Where v = −l the half vector is taken as perpendicular to both n and v: sin² θ_h = 1, cos θ_d = 0.
     /// `[eq:half-vector]`
     pub fn new(normal: Vec3, view: Vec3, light: Vec3) -> Self {
-        let (n, v, l) = (normal.as_dvec3(), view.as_dvec3(), light.as_dvec3());
-        let (cos_theta_d, sin2_theta_h) = match half_vector(v, l) {
-            Some((h, _)) => (v.dot(h) as f32, n.cross(h).length_squared().min(1.0) as f32),
-            None => (0.0, 1.0),
-        };
-        Self { cos_theta_i: n.dot(l) as f32, cos_theta_o: n.dot(v) as f32, cos_theta_d, sin2_theta_h }
+        let a = AnglesOf::new(normal.into(), view.into(), light.into());
+        let AnglesOf { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h } = a;
+        Self { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h }
     }
 
     /// Pullback of [`Angles::new`].
     /// `[eq:half-vector]`
     pub fn pull(normal: Vec3, view: Vec3, light: Vec3, d: &AnglesGrad) -> DirectionsGrad {
-        let (n, v, l) = (normal.as_dvec3(), view.as_dvec3(), light.as_dvec3());
-        let (d_i, d_o) = (f64::from(d.cos_theta_i), f64::from(d.cos_theta_o));
-        let mut d_n = l * d_i + v * d_o;
-        let mut d_v = n * d_o;
-        let mut d_l = n * d_i;
-        if let Some((h, length)) = half_vector(v, l) {
-            let (d_d, d_s) = (f64::from(d.cos_theta_d), f64::from(d.sin2_theta_h));
-            let d_cross = n.cross(h) * (2.0 * d_s);
-            d_n += h.cross(d_cross);
-            let d_h = d_cross.cross(n) + v * d_d;
-            let d_sum = (d_h - h * h.dot(d_h)) / length;
-            d_v += h * d_d + d_sum;
-            d_l += d_sum;
-        }
-        DirectionsGrad { normal: d_n.as_vec3(), view: d_v.as_vec3(), light: d_l.as_vec3() }
+        let AnglesGrad { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h } = *d;
+        let d = AnglesOf { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h };
+        AnglesOf::pull(normal.into(), view.into(), light.into(), &d).into()
     }
 }
 

@@ -13,10 +13,12 @@
 //! assert!(radiance.x > radiance.z && radiance.z > 0.0);
 //! assert_eq!(BrdfModel::default().reflect(&clay, Vec3::Z, Vec3::Z, -light, Vec3::ONE), Vec3::ZERO);
 //! ```
-use crate::angles::{Angles, AnglesGrad, DirectionsGrad};
+use crate::angles::{Angles, AnglesGrad, AnglesOf, DirectionsGrad, DirectionsGradOf};
 use crate::fresnel::Fresnel;
 use crate::ggx::{self, Masking};
-use crate::material::{DIELECTRIC_F0, Material, MaterialGrad};
+use crate::material::{DIELECTRIC_F0, Material, MaterialGrad, Surface};
+use crate::number::Number;
+use crate::vector::Vector;
 use glam::Vec3;
 use std::f32::consts::FRAC_1_PI;
 
@@ -80,67 +82,80 @@ impl BrdfModel {
     /// `[eq:brdf]` `[eq:diffuse]`
     #[inline]
     pub fn evaluate_at(&self, material: &Material, angles: &Angles) -> Vec3 {
-        let f = self.fresnel.reflectance(material.f0(), angles.cos_theta_d);
-        self.specular_without_fresnel(material, angles) * f + self.diffuse_lobe(material, f)
+        self.evaluate_of(&material.into(), &angles.into()).into()
     }
 
-    /// D·G/(4·n·v·n·l).
-    #[inline]
-    fn specular_without_fresnel(&self, material: &Material, angles: &Angles) -> f32 {
-        ggx::distribution(material.alpha(), angles.sin2_theta_h)
-            * self.masking.over_cosines(material.shaded_roughness(), angles.cos_theta_o, angles.cos_theta_i)
-    }
-
-    /// The diffuse term, given F.
-    #[inline]
-    fn diffuse_lobe(&self, material: &Material, f: Vec3) -> Vec3 {
-        let lambert = material.base_color * ((1.0 - material.metalness) * FRAC_1_PI);
-        match self.diffuse {
+    /// [`BrdfModel::evaluate_at`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn evaluate_of<T: Number>(&self, material: &Surface<T>, angles: &AnglesOf<T>) -> Vector<T> {
+        let roughness = material.shaded_roughness();
+        let f = self.fresnel.reflectance_of(material.f0(), angles.cos_theta_d);
+        let specular = ggx::distribution_of(roughness * roughness, angles.sin2_theta_h)
+            * self.masking.over_cosines_of(roughness, angles.cos_theta_o, angles.cos_theta_i);
+        let lambert = material.base_color * (material.metalness.complement() * FRAC_1_PI);
+        let diffuse = match self.diffuse {
             Diffuse::Lambert => lambert,
-            Diffuse::FresnelWeighted => (Vec3::ONE - f) * (1.0 - DIELECTRIC_F0) * lambert,
-        }
+            Diffuse::FresnelWeighted => f.complement() * specular.same(1.0 - DIELECTRIC_F0) * lambert,
+        };
+        f * specular + diffuse
     }
 
     /// Pullback of [`BrdfModel::evaluate_at`].
     /// `[eq:brdf]` `[eq:diffuse]`
     #[inline]
     pub fn evaluate_at_pull(&self, material: &Material, angles: &Angles, d_out: Vec3) -> (MaterialGrad, AnglesGrad) {
-        let (roughness, alpha) = (material.shaded_roughness(), material.alpha());
+        let (material, d) = self.evaluate_pull_of(&material.into(), &angles.into(), d_out.into());
+        let AnglesOf { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h } = d;
+        (material.into(), AnglesGrad { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h })
+    }
+
+    /// [`BrdfModel::evaluate_at_pull`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn evaluate_pull_of<T: Number>(
+        &self,
+        material: &Surface<T>,
+        angles: &AnglesOf<T>,
+        d_out: Vector<T>,
+    ) -> (Surface<T>, AnglesOf<T>) {
+        let roughness = material.shaded_roughness();
+        let alpha = roughness * roughness;
         let (f0, co, ci) = (material.f0(), angles.cos_theta_o, angles.cos_theta_i);
-        let f = self.fresnel.reflectance(f0, angles.cos_theta_d);
-        let d = ggx::distribution(alpha, angles.sin2_theta_h);
-        let g = self.masking.over_cosines(roughness, co, ci);
-        let mut grad = MaterialGrad::default();
+        let f = self.fresnel.reflectance_of(f0, angles.cos_theta_d);
+        let d = ggx::distribution_of(alpha, angles.sin2_theta_h);
+        let g = self.masking.over_cosines_of(roughness, co, ci);
 
         // Specular: d·g·F.
         let d_product = d_out.dot(f);
         let mut d_f = d_out * (d * g);
-        let (d_alpha, d_sin2) = ggx::distribution_pull(alpha, angles.sin2_theta_h, d_product * g);
-        let masking = self.masking.over_cosines_pull(roughness, co, ci, d_product * d);
-        grad.roughness = material.shaded_roughness_pull(masking.roughness + 2.0 * roughness * d_alpha);
+        let (d_alpha, d_sin2) = ggx::distribution_pull_of(alpha, angles.sin2_theta_h, d_product * g);
+        let masking = self.masking.over_cosines_pull_of(roughness, co, ci, d_product * d);
+        let d_roughness = material.shaded_roughness_pull(masking.roughness + roughness * 2.0 * d_alpha);
 
         // Diffuse.
-        let dielectric = 1.0 - material.metalness;
+        let dielectric = material.metalness.complement() * FRAC_1_PI;
         let d_lambert = match self.diffuse {
             Diffuse::Lambert => d_out,
             Diffuse::FresnelWeighted => {
-                let weight = 1.0 - DIELECTRIC_F0;
-                d_f -= d_out * weight * material.base_color * (dielectric * FRAC_1_PI);
-                d_out * (Vec3::ONE - f) * weight
+                let weighted = d_out * d.same(1.0 - DIELECTRIC_F0);
+                d_f = d_f - weighted * material.base_color * dielectric;
+                weighted * f.complement()
             }
         };
-        grad.base_color += d_lambert * (dielectric * FRAC_1_PI);
-        grad.metalness -= d_lambert.dot(material.base_color) * FRAC_1_PI;
 
-        let (d_f0, d_cos_theta_d) = self.fresnel.reflectance_pull(f0, angles.cos_theta_d, d_f);
-        material.f0_pull(d_f0, &mut grad);
-        let angles = AnglesGrad {
+        let (d_f0, d_cos_theta_d) = self.fresnel.reflectance_pull_of(f0, angles.cos_theta_d, d_f);
+        let (by_f0, metal_by_f0) = material.f0_pull(d_f0);
+        let material = Surface {
+            base_color: d_lambert * dielectric + by_f0,
+            roughness: d_roughness,
+            metalness: metal_by_f0 - d_lambert.dot(material.base_color) * FRAC_1_PI,
+        };
+        let angles = AnglesOf {
             cos_theta_i: masking.cos_theta_i,
             cos_theta_o: masking.cos_theta_o,
             cos_theta_d: d_cos_theta_d,
             sin2_theta_h: d_sin2,
         };
-        (grad, angles)
+        (material, angles)
     }
 
     /// The BRDF f, linear RGB per steradian, without the cosine; zero where n·l ≤ 0 or n·v ≤ 0.
@@ -148,7 +163,7 @@ impl BrdfModel {
     /// `[eq:brdf]`
     pub fn evaluate(&self, material: &Material, normal: Vec3, view: Vec3, light: Vec3) -> Vec3 {
         let angles = Angles::new(normal, view, light);
-        if is_positive(angles.cos_theta_i) && is_positive(angles.cos_theta_o) {
+        if angles.cos_theta_i >= MIN_COSINE && angles.cos_theta_o >= MIN_COSINE {
             self.evaluate_at(material, &angles)
         } else {
             Vec3::ZERO
@@ -187,10 +202,21 @@ impl BrdfModel {
         light: Vec3,
         irradiance: Vec3,
     ) -> Vec3 {
-        match floor.raise(Angles::new(normal, view, light)) {
-            Some(angles) => irradiance * self.evaluate_at(material, &angles) * angles.cos_theta_i,
-            None => Vec3::ZERO,
-        }
+        let facing = Facing { normal: normal.into(), view: view.into(), light: light.into() };
+        self.reflect_of(floor, &material.into(), &facing, irradiance.into()).into()
+    }
+
+    /// [`BrdfModel::reflect_above`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn reflect_of<T: Number>(
+        &self,
+        floor: CosineFloor,
+        material: &Surface<T>,
+        facing: &Facing<T>,
+        irradiance: Vector<T>,
+    ) -> Vector<T> {
+        let (angles, lit) = floor.raise(AnglesOf::new(facing.normal, facing.view, facing.light));
+        (irradiance * self.evaluate_of(material, &angles) * angles.cos_theta_i).only_where(lit)
     }
 
     /// Pullback of [`BrdfModel::reflect_above`].
@@ -205,36 +231,68 @@ impl BrdfModel {
         irradiance: Vec3,
         d_out: Vec3,
     ) -> ReflectGrad {
-        let free = Angles::new(normal, view, light);
-        let Some(angles) = floor.raise(free) else { return ReflectGrad::default() };
-        let f = self.evaluate_at(material, &angles);
-        let d_f = d_out * irradiance * angles.cos_theta_i;
-        let (material, mut d_angles) = self.evaluate_at_pull(material, &angles, d_f);
-        d_angles.cos_theta_i += (d_out * irradiance).dot(f);
-        if free.cos_theta_i < floor.light {
-            d_angles.cos_theta_i = 0.0;
-        }
-        if free.cos_theta_o < floor.view {
-            d_angles.cos_theta_o = 0.0;
-        }
-        let DirectionsGrad { normal, view, light } = Angles::pull(normal, view, light, &d_angles);
-        ReflectGrad { material, normal, view, light, irradiance: d_out * f * angles.cos_theta_i }
+        let facing = Facing { normal: normal.into(), view: view.into(), light: light.into() };
+        let (_, d) = self.reflect_pull_of(floor, &material.into(), &facing, irradiance.into(), d_out.into());
+        let DirectionsGrad { normal, view, light } = d.directions.into();
+        ReflectGrad { material: d.material.into(), normal, view, light, irradiance: d.irradiance.into() }
     }
+
+    /// [`BrdfModel::reflect_above_pull`] of one pixel or many, after the value.
+    #[inline(always)]
+    pub(crate) fn reflect_pull_of<T: Number>(
+        &self,
+        floor: CosineFloor,
+        material: &Surface<T>,
+        facing: &Facing<T>,
+        irradiance: Vector<T>,
+        d_out: Vector<T>,
+    ) -> (Vector<T>, ReflectGradOf<T>) {
+        let (n, v, l) = (facing.normal, facing.view, facing.light);
+        let free = AnglesOf::new(n, v, l);
+        let (angles, lit) = floor.raise(free);
+        let f = self.evaluate_of(material, &angles);
+        let value = (irradiance * f * angles.cos_theta_i).only_where(lit);
+        // Beyond the horizon the cosines are replaced by 1, so that everything is finite, and the cotangent by 0.
+        let d_out = d_out.only_where(lit);
+        let d_lit = d_out * irradiance;
+        let (material, mut d) = self.evaluate_pull_of(material, &angles, d_lit * angles.cos_theta_i);
+        d.cos_theta_i = (d.cos_theta_i + d_lit.dot(f)).only_where(!free.cos_theta_i.under(floor.light));
+        d.cos_theta_o = d.cos_theta_o.only_where(!free.cos_theta_o.under(floor.view));
+        let directions = AnglesOf::pull(n, v, l, &d);
+        (value, ReflectGradOf { material, directions, irradiance: d_out * f * angles.cos_theta_i })
+    }
+}
+
+/// The three unit directions of one pixel or many.
+pub(crate) struct Facing<T> {
+    pub normal: Vector<T>,
+    pub view: Vector<T>,
+    pub light: Vector<T>,
+}
+
+/// [`ReflectGrad`] of one pixel or many.
+pub(crate) struct ReflectGradOf<T> {
+    pub material: Surface<T>,
+    pub directions: DirectionsGradOf<T>,
+    pub irradiance: Vector<T>,
 }
 
 impl CosineFloor {
-    /// The angles with both cosines raised; `None` where one is still not positive.
-    fn raise(&self, angles: Angles) -> Option<Angles> {
-        let cos_theta_i = angles.cos_theta_i.max(self.light);
-        let cos_theta_o = angles.cos_theta_o.max(self.view);
-        (is_positive(cos_theta_i) && is_positive(cos_theta_o)).then_some(Angles { cos_theta_i, cos_theta_o, ..angles })
+    /// The angles with both cosines raised, and where both are positive; elsewhere they are 1.
+    #[inline(always)]
+    fn raise<T: Number>(&self, angles: AnglesOf<T>) -> (AnglesOf<T>, T::Mask) {
+        let cos_theta_i = angles.cos_theta_i.at_least(self.light);
+        let cos_theta_o = angles.cos_theta_o.at_least(self.view);
+        let lit = cos_theta_i.reaches(MIN_COSINE) & cos_theta_o.reaches(MIN_COSINE);
+        let one = cos_theta_i.same(1.0);
+        let cos_theta_i = cos_theta_i.or_where_not(lit, one);
+        let cos_theta_o = cos_theta_o.or_where_not(lit, one);
+        (AnglesOf { cos_theta_i, cos_theta_o, ..angles }, lit)
     }
 }
 
-/// Above zero and not subnormal: the reciprocal of a subnormal cosine is infinite.
-fn is_positive(cosine: f32) -> bool {
-    cosine >= f32::MIN_POSITIVE
-}
+/// Cosines count as positive from here on: the reciprocal of a subnormal one is infinite.
+const MIN_COSINE: f32 = f32::MIN_POSITIVE;
 
 #[cfg(test)]
 mod tests {

@@ -1,5 +1,8 @@
 //! Fresnel reflectance: how much a facet mirrors, from its reflectance at normal incidence.
+use crate::number::Number;
+use crate::vector::Vector;
 use glam::Vec3;
+use std::f32::consts::LN_2;
 
 /// Linear and quadratic coefficient of the spherical-Gaussian fit's exponent, for base 2.
 const SPHERICAL_GAUSSIAN: (f32, f32) = (-6.98316, -5.55473);
@@ -16,36 +19,54 @@ pub enum Fresnel {
 
 impl Fresnel {
     /// The weight between F0 and 1, and its derivative by v·h.
-    #[inline]
-    fn weight(self, cos_theta_d: f32) -> (f32, f32) {
+    #[inline(always)]
+    fn weight<T: Number>(self, cos_theta_d: T) -> (T, T) {
         match self {
             Fresnel::Schlick => {
-                let m = (1.0 - cos_theta_d).clamp(0.0, 1.0);
+                let m = cos_theta_d.complement().at_least(0.0).at_most(1.0);
                 let m2 = m * m;
-                (m2 * m2 * m, -5.0 * m2 * m2)
+                (m2 * m2 * m, m2 * m2 * -5.0)
             }
             Fresnel::SphericalGaussian => {
                 let (linear, quadratic) = SPHERICAL_GAUSSIAN;
-                let weight = ((quadratic * cos_theta_d + linear) * cos_theta_d).exp2();
-                (weight, weight * std::f32::consts::LN_2 * (2.0 * quadratic * cos_theta_d + linear))
+                let weight = ((cos_theta_d * (quadratic * LN_2) + linear * LN_2) * cos_theta_d).exp();
+                (weight, weight * LN_2 * (cos_theta_d * (2.0 * quadratic) + linear))
             }
         }
+    }
+
+    /// [`Fresnel::reflectance`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn reflectance_of<T: Number>(self, f0: Vector<T>, cos_theta_d: T) -> Vector<T> {
+        let (weight, _) = self.weight(cos_theta_d);
+        f0 + f0.complement() * weight
+    }
+
+    /// [`Fresnel::reflectance_pull`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn reflectance_pull_of<T: Number>(
+        self,
+        f0: Vector<T>,
+        cos_theta_d: T,
+        d_out: Vector<T>,
+    ) -> (Vector<T>, T) {
+        let (weight, slope) = self.weight(cos_theta_d);
+        (d_out * weight.complement(), d_out.dot(f0.complement()) * slope)
     }
 
     /// Reflectance of a facet, linear RGB, for the reflectance `f0` at normal incidence and v·h in `[0, 1]`.
     /// `[eq:fresnel-schlick]` `[eq:fresnel-spherical-gaussian]`
     #[inline]
     pub fn reflectance(self, f0: Vec3, cos_theta_d: f32) -> Vec3 {
-        let (weight, _) = self.weight(cos_theta_d);
-        f0 + (Vec3::ONE - f0) * weight
+        self.reflectance_of(f0.into(), cos_theta_d).into()
     }
 
     /// Pullback of [`Fresnel::reflectance`]: `(d_f0, d_cos_theta_d)`.
     /// `[eq:fresnel-schlick]` `[eq:fresnel-spherical-gaussian]`
     #[inline]
     pub fn reflectance_pull(self, f0: Vec3, cos_theta_d: f32, d_out: Vec3) -> (Vec3, f32) {
-        let (weight, slope) = self.weight(cos_theta_d);
-        (d_out * (1.0 - weight), d_out.dot(Vec3::ONE - f0) * slope)
+        let (d_f0, d_cos_theta_d) = self.reflectance_pull_of(f0.into(), cos_theta_d, d_out.into());
+        (d_f0.into(), d_cos_theta_d)
     }
 }
 

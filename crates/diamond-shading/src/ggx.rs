@@ -5,6 +5,7 @@
 //!
 //! Arguments are scalars: α = roughness² in `[1e-6, 1]`, cosines in `(0, 1]`, sin² θ_h in `[0, 1]` (see
 //! [`Angles`](crate::Angles)).
+use crate::number::Number;
 use std::f32::consts::FRAC_1_PI;
 
 /// The denominator of the height-correlated term is at least this: it vanishes where both cosines do (reached only below
@@ -17,26 +18,38 @@ const MIN_CORRELATED_DENOMINATOR: f32 = 1e-12;
 /// `[eq:ggx-d]`
 #[inline]
 pub fn distribution(alpha: f32, sin2_theta_h: f32) -> f32 {
+    distribution_of(alpha, sin2_theta_h)
+}
+
+/// [`distribution`] of one pixel or many.
+#[inline(always)]
+pub(crate) fn distribution_of<T: Number>(alpha: T, sin2_theta_h: T) -> T {
     let ratio = alpha / ellipsoid(alpha, sin2_theta_h);
     ratio * ratio * FRAC_1_PI
 }
 
 /// α²·cos²θ_h + sin²θ_h, a sum of positive terms.
-#[inline]
-fn ellipsoid(alpha: f32, sin2_theta_h: f32) -> f32 {
-    alpha * alpha * (1.0 - sin2_theta_h) + sin2_theta_h
+#[inline(always)]
+fn ellipsoid<T: Number>(alpha: T, sin2_theta_h: T) -> T {
+    alpha * alpha * sin2_theta_h.complement() + sin2_theta_h
 }
 
 /// Pullback of [`distribution`]: `(d_alpha, d_sin2_theta_h)`.
 /// `[eq:ggx-d]`
 #[inline]
 pub fn distribution_pull(alpha: f32, sin2_theta_h: f32, d_out: f32) -> (f32, f32) {
+    distribution_pull_of(alpha, sin2_theta_h, d_out)
+}
+
+/// [`distribution_pull`] of one pixel or many.
+#[inline(always)]
+pub(crate) fn distribution_pull_of<T: Number>(alpha: T, sin2_theta_h: T, d_out: T) -> (T, T) {
     let t = ellipsoid(alpha, sin2_theta_h);
     let ratio = alpha / t;
     let d = d_out * 2.0 * ratio * ratio * FRAC_1_PI;
     // ∂t/∂α = 2α·cos²θ_h, ∂t/∂sin² = 1 − α².
-    let d_alpha = d * (sin2_theta_h - alpha * alpha * (1.0 - sin2_theta_h)) / (alpha * t);
-    (d_alpha, -d * (1.0 - alpha) * (1.0 + alpha) / t)
+    let d_alpha = d * (sin2_theta_h - alpha * alpha * sin2_theta_h.complement()) / (alpha * t);
+    (d_alpha, -d * alpha.complement() * (alpha + 1.0) / t)
 }
 
 /// Which masking and shadowing term G.
@@ -64,86 +77,97 @@ pub struct MaskingGrad {
     pub cos_theta_i: f32,
 }
 
+/// [`MaskingGrad`] of one pixel or many.
+pub(crate) struct MaskingGradOf<T> {
+    pub roughness: T,
+    pub cos_theta_o: T,
+    pub cos_theta_i: T,
+}
+
 /// One direction's factor of the masking, with its derivatives.
-struct Factor {
-    value: f32,
-    by_cosine: f32,
+struct Factor<T> {
+    value: T,
+    by_cosine: T,
     /// By α for Smith, by k for Schlick.
-    by_width: f32,
+    by_width: T,
 }
 
 /// √(cos² + α²·sin²): the length that Smith's Λ = (root/cos − 1)/2 is made of.
-#[inline]
-fn smith_root(alpha: f32, cosine: f32) -> Factor {
-    let sin2 = (1.0 - cosine) * (1.0 + cosine);
-    let value = (cosine * cosine + alpha * alpha * sin2).sqrt();
-    let by_cosine = cosine * (1.0 - alpha) * (1.0 + alpha) / value;
+#[inline(always)]
+fn smith_root<T: Number>(alpha: T, cosine: T) -> Factor<T> {
+    let sin2 = cosine.complement() * (cosine + 1.0);
+    let value = (cosine * cosine + alpha * alpha * sin2).root();
+    let by_cosine = cosine * alpha.complement() * (alpha + 1.0) / value;
     Factor { value, by_cosine, by_width: alpha * sin2 / value }
 }
 
 /// cos·(1 − k) + k: the denominator of Schlick's G₁ = cos / (cos·(1 − k) + k).
-#[inline]
-fn schlick_denominator(k: f32, cosine: f32) -> Factor {
-    Factor { value: cosine * (1.0 - k) + k, by_cosine: 1.0 - k, by_width: 1.0 - cosine }
+#[inline(always)]
+fn schlick_denominator<T: Number>(k: T, cosine: T) -> Factor<T> {
+    Factor { value: cosine * k.complement() + k, by_cosine: k.complement(), by_width: cosine.complement() }
 }
 
 impl Masking {
     /// k of Schlick's form and dk/droughness.
-    #[inline]
-    fn schlick_k(self, roughness: f32) -> (f32, f32) {
+    #[inline(always)]
+    fn schlick_k<T: Number>(self, roughness: T) -> (T, T) {
         match self {
-            Masking::SchlickRoughness => (0.125 * (roughness + 1.0) * (roughness + 1.0), 0.25 * (roughness + 1.0)),
-            _ => (0.5 * roughness * roughness, roughness),
+            Masking::SchlickRoughness => ((roughness + 1.0) * (roughness + 1.0) * 0.125, (roughness + 1.0) * 0.25),
+            _ => (roughness * roughness * 0.5, roughness),
         }
     }
 
-    /// G/(4·n·v·n·l) for a roughness in `[1e-3, 1]` and cosines in `(0, 1]`.
-    /// `[eq:smith-separable]` `[eq:smith-correlated]` `[eq:schlick-ggx]`
-    #[inline]
-    pub fn over_cosines(self, roughness: f32, cos_theta_o: f32, cos_theta_i: f32) -> f32 {
+    /// [`Masking::over_cosines`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn over_cosines_of<T: Number>(self, roughness: T, cos_theta_o: T, cos_theta_i: T) -> T {
         let alpha = roughness * roughness;
         match self {
             Masking::SmithSeparable => {
                 let o = cos_theta_o + smith_root(alpha, cos_theta_o).value;
                 let i = cos_theta_i + smith_root(alpha, cos_theta_i).value;
-                1.0 / (o * i)
+                (o * i).inverse()
             }
             Masking::SmithCorrelated => {
                 let (o, i) = (smith_root(alpha, cos_theta_o).value, smith_root(alpha, cos_theta_i).value);
-                0.5 / (cos_theta_i * o + cos_theta_o * i).max(MIN_CORRELATED_DENOMINATOR)
+                let sum = cos_theta_i * o + cos_theta_o * i;
+                sum.same(0.5) / sum.at_least(MIN_CORRELATED_DENOMINATOR)
             }
             Masking::SchlickRoughness | Masking::SchlickHalfAlpha => {
                 let (k, _) = self.schlick_k(roughness);
-                0.25 / (schlick_denominator(k, cos_theta_o).value * schlick_denominator(k, cos_theta_i).value)
+                k.same(0.25) / (schlick_denominator(k, cos_theta_o).value * schlick_denominator(k, cos_theta_i).value)
             }
         }
     }
 
-    /// Pullback of [`Masking::over_cosines`].
-    /// `[eq:smith-separable]` `[eq:smith-correlated]` `[eq:schlick-ggx]`
-    #[inline]
-    pub fn over_cosines_pull(self, roughness: f32, cos_theta_o: f32, cos_theta_i: f32, d_out: f32) -> MaskingGrad {
+    /// [`Masking::over_cosines_pull`] of one pixel or many.
+    #[inline(always)]
+    pub(crate) fn over_cosines_pull_of<T: Number>(
+        self,
+        roughness: T,
+        cos_theta_o: T,
+        cos_theta_i: T,
+        d_out: T,
+    ) -> MaskingGradOf<T> {
         let alpha = roughness * roughness;
         match self {
             Masking::SmithSeparable => {
                 let (root_o, root_i) = (smith_root(alpha, cos_theta_o), smith_root(alpha, cos_theta_i));
                 let (o, i) = (cos_theta_o + root_o.value, cos_theta_i + root_i.value);
                 let d = -d_out / (o * i);
-                MaskingGrad {
+                MaskingGradOf {
                     roughness: d * (root_o.by_width / o + root_i.by_width / i) * 2.0 * roughness,
-                    cos_theta_o: d * (1.0 + root_o.by_cosine) / o,
-                    cos_theta_i: d * (1.0 + root_i.by_cosine) / i,
+                    cos_theta_o: d * (root_o.by_cosine + 1.0) / o,
+                    cos_theta_i: d * (root_i.by_cosine + 1.0) / i,
                 }
             }
             Masking::SmithCorrelated => {
                 let (o, i) = (smith_root(alpha, cos_theta_o), smith_root(alpha, cos_theta_i));
                 let sum = cos_theta_i * o.value + cos_theta_o * i.value;
-                if sum < MIN_CORRELATED_DENOMINATOR {
-                    return MaskingGrad::default();
-                }
-                // One division at a time: sum² may leave the range of f32.
-                let d = -d_out * (0.5 / sum) / sum;
-                MaskingGrad {
+                // Below the guard the value is constant. One division at a time: sum² may leave the range of f32.
+                let free = sum.reaches(MIN_CORRELATED_DENOMINATOR);
+                let sum = sum.at_least(MIN_CORRELATED_DENOMINATOR);
+                let d = (-d_out * (sum.same(0.5) / sum) / sum).only_where(free);
+                MaskingGradOf {
                     roughness: d * (cos_theta_i * o.by_width + cos_theta_o * i.by_width) * 2.0 * roughness,
                     cos_theta_o: d * (cos_theta_i * o.by_cosine + i.value),
                     cos_theta_i: d * (o.value + cos_theta_o * i.by_cosine),
@@ -153,13 +177,28 @@ impl Masking {
                 let (k, k_by_roughness) = self.schlick_k(roughness);
                 let (o, i) = (schlick_denominator(k, cos_theta_o), schlick_denominator(k, cos_theta_i));
                 let d = -d_out * 0.25 / (o.value * i.value);
-                MaskingGrad {
+                MaskingGradOf {
                     roughness: d * (o.by_width / o.value + i.by_width / i.value) * k_by_roughness,
                     cos_theta_o: d * o.by_cosine / o.value,
                     cos_theta_i: d * i.by_cosine / i.value,
                 }
             }
         }
+    }
+
+    /// G/(4·n·v·n·l) for a roughness in `[1e-3, 1]` and cosines in `(0, 1]`.
+    /// `[eq:smith-separable]` `[eq:smith-correlated]` `[eq:schlick-ggx]`
+    #[inline]
+    pub fn over_cosines(self, roughness: f32, cos_theta_o: f32, cos_theta_i: f32) -> f32 {
+        self.over_cosines_of(roughness, cos_theta_o, cos_theta_i)
+    }
+
+    /// Pullback of [`Masking::over_cosines`].
+    /// `[eq:smith-separable]` `[eq:smith-correlated]` `[eq:schlick-ggx]`
+    #[inline]
+    pub fn over_cosines_pull(self, roughness: f32, cos_theta_o: f32, cos_theta_i: f32, d_out: f32) -> MaskingGrad {
+        let d = self.over_cosines_pull_of(roughness, cos_theta_o, cos_theta_i, d_out);
+        MaskingGrad { roughness: d.roughness, cos_theta_o: d.cos_theta_o, cos_theta_i: d.cos_theta_i }
     }
 
     /// G itself, in `[0, 1]`: the share of facets that both the viewer and the light see.

@@ -53,6 +53,7 @@ pub mod ggx;
 mod material;
 mod mlp;
 mod mlp_chunk;
+mod number;
 mod prepared;
 mod pseudo_normal;
 mod residual;
@@ -62,6 +63,7 @@ mod shaded;
 mod simd;
 mod surface_point;
 mod transfer;
+mod vector;
 
 pub use angles::{Angles, AnglesGrad, DirectionsGrad};
 pub use brdf::{BrdfModel, CosineFloor, Diffuse, ReflectGrad};

@@ -3,6 +3,8 @@
 //! A material is the metal/rough parametrisation of real-time rendering: a base colour that is the albedo of a
 //! dielectric or the reflectance of a metal, a perceptual roughness whose square is the width α of the microfacet
 //! distribution, and a metalness that moves between dielectric and metal.
+use crate::number::Number;
+use crate::vector::Vector;
 use glam::Vec3;
 
 /// Reflectance at normal incidence of a dielectric: an index of refraction of 1.5.
@@ -34,11 +36,66 @@ pub struct MaterialGrad {
     pub metalness: f32,
 }
 
+/// The numbers of a [`Material`], or of its gradient, of one pixel or of many.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Surface<T> {
+    pub base_color: Vector<T>,
+    pub roughness: T,
+    pub metalness: T,
+}
+
+impl<T: Number> Surface<T> {
+    /// [`Material::shaded_roughness`].
+    #[inline(always)]
+    pub fn shaded_roughness(&self) -> T {
+        self.roughness.at_least(MIN_ROUGHNESS).at_most(1.0)
+    }
+
+    /// [`Material::shaded_roughness_pull`].
+    #[inline(always)]
+    pub fn shaded_roughness_pull(&self, d_roughness: T) -> T {
+        d_roughness.only_where(self.roughness.reaches(MIN_ROUGHNESS) & (-self.roughness).reaches(-1.0))
+    }
+
+    #[inline(always)]
+    fn above_dielectric(&self) -> Vector<T> {
+        let c = self.base_color;
+        Vector::new(c.x - DIELECTRIC_F0, c.y - DIELECTRIC_F0, c.z - DIELECTRIC_F0)
+    }
+
+    /// [`Material::f0`].
+    #[inline(always)]
+    pub fn f0(&self) -> Vector<T> {
+        let c = self.above_dielectric() * self.metalness;
+        Vector::new(c.x + DIELECTRIC_F0, c.y + DIELECTRIC_F0, c.z + DIELECTRIC_F0)
+    }
+
+    /// [`Material::f0_pull`]: of the base colour and the metalness.
+    #[inline(always)]
+    pub fn f0_pull(&self, d_f0: Vector<T>) -> (Vector<T>, T) {
+        (d_f0 * self.metalness, d_f0.dot(self.above_dielectric()))
+    }
+}
+
+impl From<&Material> for Surface<f32> {
+    #[inline(always)]
+    fn from(m: &Material) -> Self {
+        Self { base_color: m.base_color.into(), roughness: m.roughness, metalness: m.metalness }
+    }
+}
+
+impl From<Surface<f32>> for MaterialGrad {
+    #[inline(always)]
+    fn from(d: Surface<f32>) -> Self {
+        Self { base_color: d.base_color.into(), roughness: d.roughness, metalness: d.metalness }
+    }
+}
+
 impl Material {
     /// The roughness that is shaded: clamped to `[MIN_ROUGHNESS, 1]`.
     #[inline]
     pub fn shaded_roughness(&self) -> f32 {
-        self.roughness.clamp(MIN_ROUGHNESS, 1.0)
+        Surface::from(self).shaded_roughness()
     }
 
     /// Width α of the microfacet distribution: the square of the shaded roughness, dimensionless.
@@ -53,21 +110,22 @@ impl Material {
     /// `[eq:f0]`
     #[inline]
     pub fn f0(&self) -> Vec3 {
-        Vec3::splat(DIELECTRIC_F0) + self.metalness * (self.base_color - DIELECTRIC_F0)
+        Surface::from(self).f0().into()
     }
 
     /// Pullback of [`Material::f0`], added to `grad`.
     /// `[eq:f0]`
     #[inline]
     pub fn f0_pull(&self, d_f0: Vec3, grad: &mut MaterialGrad) {
-        grad.base_color += self.metalness * d_f0;
-        grad.metalness += d_f0.dot(self.base_color - DIELECTRIC_F0);
+        let (base_color, metalness) = Surface::from(self).f0_pull(d_f0.into());
+        grad.base_color += Vec3::from(base_color);
+        grad.metalness += metalness;
     }
 
     /// Pullback of [`Material::shaded_roughness`]: the cotangent passes inside the range and stops outside it.
     #[inline]
     pub fn shaded_roughness_pull(&self, d_roughness: f32) -> f32 {
-        if (MIN_ROUGHNESS..=1.0).contains(&self.roughness) { d_roughness } else { 0.0 }
+        Surface::from(self).shaded_roughness_pull(d_roughness)
     }
 }
 
