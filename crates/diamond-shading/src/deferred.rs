@@ -9,14 +9,15 @@
 //! [`ShadingConfig::scale_residual_by_light`].
 use crate::ShadingError;
 use crate::brdf::BrdfModel;
-use crate::gbuffer::{Blended, GBuffer, GBufferGrad, channel};
+use crate::gbuffer::{GBuffer, GBufferGrad, channel};
+use crate::pixels::{INPUTS, PullRow, Scene, ShadeRow};
 use crate::row_chunks::map_chunks_mut;
-use crate::shaded::{RECORD, Shaded, ShadedGrad, record, unpack};
-use crate::surface_point::{SurfacePoint, Transport};
+use crate::shaded::{RECORD, Shaded, ShadedGrad, unpack};
+use crate::surface_point::Eye;
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::{Falloff, OlatLight};
-use glam::Vec2;
+use diamond_simd::Level;
 
 /// Where the light's irradiance at a point comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -94,19 +95,8 @@ impl Default for ShadingConfig {
 #[derive(Debug, Clone, Copy)]
 pub struct ShadePullback<'a> {
     gbuffer: GBuffer<'a>,
-    camera: Camera,
-    light: OlatLight,
-    config: ShadingConfig,
-}
-
-/// The centre of a pixel.
-pub(crate) fn centre(x: usize, y: usize) -> Vec2 {
-    Vec2::new(x as f32 + 0.5, y as f32 + 0.5)
-}
-
-/// The `N` values of `pixel` from channel `from` on.
-pub(crate) fn features<const N: usize>(pixel: &[f32], from: usize) -> [f32; N] {
-    std::array::from_fn(|i| pixel[from + i])
+    scene: Scene,
+    level: Level,
 }
 
 impl ShadingConfig {
@@ -145,33 +135,32 @@ pub fn shade<'a>(
     light: &OlatLight,
     config: &ShadingConfig,
 ) -> Result<(Shaded, ShadePullback<'a>), ShadingError> {
+    shade_at(Level::current(), gbuffer, camera, light, config)
+}
+
+/// [`shade`] on a chosen instruction set instead of the process's, to compare them.
+///
+/// # Errors
+/// As [`shade`].
+pub fn shade_at<'a>(
+    level: Level,
+    gbuffer: &GBuffer<'a>,
+    camera: &Camera,
+    light: &OlatLight,
+    config: &ShadingConfig,
+) -> Result<(Shaded, ShadePullback<'a>), ShadingError> {
     let (width, height) = gbuffer.check(camera, channel::COUNT)?;
     config.check()?;
-    let pullback = ShadePullback { gbuffer: *gbuffer, camera: *camera, light: *light, config: *config };
+    let scene = Scene { eye: Eye::new(camera), light: *light, config: *config };
+    let pullback = ShadePullback { gbuffer: *gbuffer, scene, level };
     let mut records = Image::new(width, height, RECORD);
-    map_chunks_mut(records.data_mut(), width * RECORD, |y, row| {
-        for (x, out) in row.as_chunks_mut::<RECORD>().0.iter_mut().enumerate() {
-            if let Some((blended, point, transport)) = pullback.point(x, y) {
-                let lit = point.light(&transport, light, config);
-                *out = record(&point, &transport, &lit, blended.opacity);
-            }
-        }
+    map_chunks_mut(records.data_mut(), width * RECORD, |y, out| {
+        level.dispatch(ShadeRow { gbuffer, scene: &scene, y, out });
     });
     Ok((unpack(&records), pullback))
 }
 
 impl ShadePullback<'_> {
-    /// What pixel `(x, y)` is shaded with; `None` where it is empty.
-    fn point(&self, x: usize, y: usize) -> Option<(Blended<{ channel::COUNT }>, SurfacePoint, Transport)> {
-        let g = &self.gbuffer;
-        let sums = features(g.features.pixel(x, y), 0);
-        let blended = Blended::new(&sums, g.opacity.pixel(x, y)[0], g.depth.pixel(x, y)[0], self.config.normalise)?;
-        let geometry = features(&blended.features, channel::GEOMETRY.start);
-        let point = SurfacePoint::new(&geometry, blended.depth, centre(x, y), &self.camera, &self.config);
-        let transport = Transport::new(&features(&blended.features, channel::TRANSPORT.start));
-        Some((blended, point, transport))
-    }
-
     /// Cotangents of the blended channels, opacity and depth for those of the shaded view.
     /// `[eq:deferred-composite]`
     ///
@@ -180,35 +169,210 @@ impl ShadePullback<'_> {
     pub fn pull(&self, d: &ShadedGrad) -> Result<GBufferGrad, ShadingError> {
         let (width, height, _) = self.gbuffer.opacity.shape();
         d.check(width, height)?;
-        const COUNT: usize = channel::COUNT + 2;
-        let mut grads = Image::new(width, height, COUNT);
-        map_chunks_mut(grads.data_mut(), width * COUNT, |y, row| {
-            for (x, out) in row.as_chunks_mut::<COUNT>().0.iter_mut().enumerate() {
-                let Some((blended, point, transport)) = self.point(x, y) else { continue };
-                let (d_radiance, maps) = d.at(x, y);
-                let lit = point.light(&transport, &self.light, &self.config);
-                let d_opacity = d_radiance.dot(lit.surface + lit.subsurface);
-                let (geometry, transported, d_depth) = point.light_pull(
-                    &transport,
-                    &self.light,
-                    &self.camera,
-                    &self.config,
-                    d_radiance * blended.opacity,
-                    maps,
-                );
-                let mut d_features = [0.0; channel::COUNT];
-                d_features[channel::GEOMETRY].copy_from_slice(&geometry);
-                d_features[channel::TRANSPORT].copy_from_slice(&transported);
-                let (d_sums, d_opacity, d_depth) = blended.pull(&d_features, d_opacity, d_depth, self.config.normalise);
-                out[..channel::COUNT].copy_from_slice(&d_sums);
-                out[channel::COUNT] = d_opacity;
-                out[channel::COUNT + 1] = d_depth;
-            }
+        let mut grads = Image::new(width, height, INPUTS);
+        let (gbuffer, scene) = (&self.gbuffer, &self.scene);
+        map_chunks_mut(grads.data_mut(), width * INPUTS, |y, out| {
+            self.level.dispatch(PullRow { gbuffer, scene, d, y, out });
         });
         Ok(GBufferGrad {
             features: grads.channels_range(0..channel::COUNT),
             opacity: grads.channels_range(channel::COUNT..channel::COUNT + 1),
-            depth: grads.channels_range(channel::COUNT + 1..COUNT),
+            depth: grads.channels_range(channel::COUNT + 1..INPUTS),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::brdf::{BrdfModel, Diffuse};
+    use crate::fresnel::Fresnel;
+    use crate::ggx::Masking;
+    use crate::pixels::{pull_pixels, shade_pixels};
+    use crate::shaded::{COTANGENTS, ShadedMapsGrad};
+    use diamond_camera::{Intrinsics, Pose};
+    use glam::Vec3;
+
+    const W: usize = 37;
+    const H: usize = 6;
+
+    /// Numbers in [0, 1) that look random.
+    struct Draw(u32);
+
+    impl Draw {
+        fn next(&mut self) -> f32 {
+            self.0 = self.0.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (self.0 >> 8) as f32 / 16_777_216.0
+        }
+    }
+
+    fn camera() -> Camera {
+        let intrinsics = Intrinsics { fx: 40.0, fy: 38.0, cx: 18.3, cy: 2.9, width: W as u32, height: H as u32 };
+        Camera { intrinsics, pose: Pose::look_at(Vec3::new(0.3, -0.4, -3.0), Vec3::new(0.1, 0.0, 0.2), Vec3::Y) }
+    }
+
+    /// Random pixels; every other one is degenerate in some way. A stretch of a block is empty.
+    fn pixels() -> Vec<[f32; INPUTS]> {
+        let mut draw = Draw(7);
+        let camera = camera();
+        (0..W * H)
+            .map(|i| {
+                let (x, y) = (i % W, i / W);
+                let mut f: [f32; INPUTS] = std::array::from_fn(|_| draw.next());
+                for k in channel::NORMAL {
+                    f[k] = 2.0 * f[k] - 1.0;
+                }
+                let ray = camera.ray(glam::Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).direction;
+                let mut normal = |n: Vec3| f[channel::NORMAL].copy_from_slice(&n.to_array());
+                let (mut opacity, mut depth) = (0.05 + 0.95 * draw.next(), 2.0 + 2.0 * draw.next());
+                match i % 26 {
+                    1 => opacity = 0.0,
+                    3 => opacity = 1e-6,
+                    5 => opacity = f32::NAN,
+                    7 => normal(Vec3::ZERO),
+                    9 => normal(Vec3::splat(1e-7)),
+                    11 => normal(ray.any_orthogonal_vector()),
+                    13 => normal(ray),
+                    15 => normal(Vec3::splat(1e30)),
+                    17 => f[channel::ROUGHNESS] = 0.0,
+                    19 => f[channel::ROUGHNESS] = 3.0,
+                    21 => depth = 0.0,
+                    23 => normal(-ray),
+                    25 => opacity = 1e-5,
+                    _ => {}
+                }
+                if y == 3 && x < 18 {
+                    opacity = 0.0;
+                }
+                for k in 0..channel::COUNT {
+                    f[k] *= if opacity > 1e-5 { opacity } else { 1.0 };
+                }
+                (f[channel::COUNT], f[channel::COUNT + 1]) = (opacity, depth * opacity.max(0.0));
+                f
+            })
+            .collect()
+    }
+
+    fn image(channels: usize, values: impl Iterator<Item = f32>) -> Image {
+        Image::from_vec(W, H, channels, values.collect()).expect("shape")
+    }
+
+    fn cotangent() -> (Vec<[f32; COTANGENTS]>, ShadedGrad) {
+        let mut draw = Draw(99);
+        let d: Vec<[f32; COTANGENTS]> = (0..W * H).map(|_| std::array::from_fn(|_| 2.0 * draw.next() - 1.0)).collect();
+        let part =
+            |range: std::ops::Range<usize>| Some(image(range.len(), d.iter().flat_map(|p| p[range.clone()].to_vec())));
+        let maps = ShadedMapsGrad {
+            base_color: part(3..6),
+            roughness: part(6..7),
+            metalness: part(7..8),
+            subsurfaceness: part(8..9),
+            normal: part(9..12),
+            residual: part(12..15),
+            incident: part(15..16),
+            visibility: part(16..17),
+            depth: part(17..18),
+        };
+        let grad = ShadedGrad { radiance: part(0..3), maps };
+        (d, grad)
+    }
+
+    /// All numbers of a view, pixel by pixel in the order of its record.
+    fn records(s: &Shaded) -> Vec<f32> {
+        let m = &s.maps;
+        let images = [
+            &s.radiance,
+            &s.surface,
+            &s.subsurface,
+            &m.base_color,
+            &m.roughness,
+            &m.metalness,
+            &m.subsurfaceness,
+            &m.normal,
+            &m.residual,
+            &m.incident,
+            &m.visibility,
+            &m.depth,
+        ];
+        (0..W * H).flat_map(|i| images.iter().flat_map(move |image| image.pixel(i % W, i / W).to_vec())).collect()
+    }
+
+    fn grads(g: &GBufferGrad) -> Vec<f32> {
+        let images = [&g.features, &g.opacity, &g.depth];
+        (0..W * H).flat_map(|i| images.iter().flat_map(move |image| image.pixel(i % W, i / W).to_vec())).collect()
+    }
+
+    /// The largest difference, relative with a floor of 1e-3 of the largest number of the same kind.
+    fn worst(a: &[f32], b: &[f32], channels: usize) -> f32 {
+        let mut scale = vec![1e-3f32; channels];
+        b.iter().enumerate().for_each(|(i, v)| scale[i % channels] = scale[i % channels].max(v.abs() * 1e-3));
+        let gap = |(i, (a, b)): (usize, (&f32, &f32))| (a - b).abs() / b.abs().max(scale[i % channels]);
+        a.iter().zip(b).enumerate().map(gap).fold(0.0, f32::max)
+    }
+
+    /// Vectors of any width against single numbers, forward and backward: the same bits, but where e^x takes part, which fused
+    /// instruction sets round otherwise.
+    /// `[eq:deferred-composite]`
+    #[test]
+    fn every_instruction_set_shades_as_single_numbers_do() {
+        let pixels = pixels();
+        let features = image(channel::COUNT, pixels.iter().flat_map(|p| p[..channel::COUNT].to_vec()));
+        let opacity = image(1, pixels.iter().map(|p| p[channel::COUNT]));
+        let depth = image(1, pixels.iter().map(|p| p[channel::COUNT + 1]));
+        let gbuffer = GBuffer { features: &features, opacity: &opacity, depth: &depth };
+        let (d, grad) = cotangent();
+        let camera = camera();
+        let point = OlatLight::Point { position: Vec3::new(1.0, -1.0, -2.0), intensity: Vec3::new(1.0, 1.2, 0.8) };
+        let far = OlatLight::Directional { direction: Vec3::new(0.0, -0.6, -0.8), irradiance: Vec3::ONE };
+        let mut configs = Vec::new();
+        for masking in
+            [Masking::SmithSeparable, Masking::SmithCorrelated, Masking::SchlickRoughness, Masking::SchlickHalfAlpha]
+        {
+            for (i, fresnel) in [Fresnel::Schlick, Fresnel::SphericalGaussian].into_iter().enumerate() {
+                let other = i == 1;
+                let brdf =
+                    BrdfModel { masking, fresnel, diffuse: if other { Diffuse::Lambert } else { Diffuse::default() } };
+                let falloff = Falloff::InverseSquare { reference: 2.0 };
+                configs.push(ShadingConfig { brdf, ..ShadingConfig::default() });
+                configs.push(ShadingConfig {
+                    brdf,
+                    incident: IncidentModel::Physical(falloff),
+                    combine: Combine::Additive,
+                    normalise: other,
+                    visibility: SurfaceVisibility::Multiplied,
+                    horizon_leak: 0.001,
+                    scale_residual_by_light: true,
+                    ..ShadingConfig::default()
+                });
+            }
+        }
+        let (mut worst_of_exp, mut compared) = (0.0f32, 0);
+        for config in configs {
+            for light in [point, far] {
+                let scene = Scene { eye: Eye::new(&camera), light, config };
+                let centre = |i: usize| ((i % W) as f32 + 0.5, (i / W) as f32 + 0.5);
+                let expected: Vec<f32> = (0..W * H).flat_map(|i| shade_pixels(&scene, pixels[i], centre(i))).collect();
+                let expected_grads: Vec<f32> =
+                    (0..W * H).flat_map(|i| pull_pixels(&scene, pixels[i], centre(i), d[i])).collect();
+                assert!(expected.iter().chain(&expected_grads).all(|v| v.is_finite()), "{config:?}");
+                let mut fused: Option<(Vec<f32>, Vec<f32>)> = None;
+                for level in Level::testable() {
+                    let (shaded, pullback) = shade_at(level, &gbuffer, &camera, &light, &config).expect("shapes");
+                    let found = (records(&shaded), grads(&pullback.pull(&grad).expect("shapes")));
+                    if config.brdf.fresnel == Fresnel::Schlick || !level.is_fused() {
+                        assert!(found.0 == expected, "{level:?} {config:?} {:e}", worst(&found.0, &expected, RECORD));
+                        let gap = worst(&found.1, &expected_grads, INPUTS);
+                        assert!(found.1 == expected_grads, "{level:?} {config:?} {gap:e}");
+                    } else {
+                        let gap = worst(&found.0, &expected, RECORD).max(worst(&found.1, &expected_grads, INPUTS));
+                        worst_of_exp = worst_of_exp.max(gap);
+                        assert!(*fused.get_or_insert_with(|| found.clone()) == found, "{level:?} {config:?}");
+                    }
+                    compared += 1;
+                }
+            }
+        }
+        println!("{compared} comparisons; worst where e^x takes part {worst_of_exp:e}");
+        assert!(worst_of_exp <= 2e-4, "{worst_of_exp:e}");
     }
 }

@@ -5,6 +5,7 @@
 //! first, and the shaded colour is multiplied by O at the end.
 use crate::ShadingError;
 use crate::error::check_image;
+use crate::number::Number;
 use diamond_camera::Camera;
 use diamond_image::Image;
 
@@ -62,43 +63,52 @@ pub struct GBufferGrad {
     pub depth: Image,
 }
 
-/// One pixel, divided by its opacity.
+/// One pixel or many, divided by their opacity.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Blended<const N: usize> {
-    /// Features of the surface.
-    pub features: [f32; N],
-    /// O.
-    pub opacity: f32,
-    /// View-space z of the surface, scene units.
-    pub depth: f32,
+pub(crate) struct Blended<T: Number, const N: usize> {
+    /// Features of the surface; 0 where it is empty.
+    pub features: [T; N],
+    /// O; 1 where it is empty.
+    pub opacity: T,
+    /// View-space z of the surface, scene units; 0 where it is empty.
+    pub depth: T,
     /// What the features were multiplied by: 1/O, or 1 where they are not divided.
-    pub weight: f32,
+    pub weight: T,
+    /// Where the pixel is not empty.
+    pub covered: T::Mask,
 }
 
-impl<const N: usize> Blended<N> {
-    /// Divides one pixel's sums by its opacity; `None` for an empty pixel. The depth is always divided, the features if
-    /// `normalise`.
+impl<T: Number, const N: usize> Blended<T, N> {
+    /// Divides a pixel's sums by its opacity. The depth is always divided, the features if `normalise`.
     /// `[eq:gbuffer-normalise]`
-    #[inline]
-    pub fn new(sums: &[f32; N], opacity: f32, depth: f32, normalise: bool) -> Option<Self> {
-        if opacity.is_nan() || opacity < MIN_OPACITY {
-            return None;
+    #[inline(always)]
+    pub fn new(sums: &[T; N], opacity: T, depth: T, normalise: bool) -> Self {
+        let covered = opacity.reaches(MIN_OPACITY);
+        let opacity = opacity.or_where_not(covered, opacity.same(1.0));
+        let weight = if normalise { opacity.inverse() } else { opacity.same(1.0) };
+        let mut features = *sums;
+        for f in &mut features {
+            *f = (*f * weight).only_where(covered);
         }
-        let weight = if normalise { 1.0 / opacity } else { 1.0 };
-        Some(Self { features: sums.map(|f| f * weight), opacity, depth: depth / opacity, weight })
+        Self { features, opacity, depth: (depth / opacity).only_where(covered), weight, covered }
     }
 
     /// Pullback of [`Blended::new`]: `(d_sums, d_opacity, d_depth)` of the sums, where `d_opacity` on entry is the
-    /// cotangent of the opacity from its other uses.
+    /// cotangent of the opacity from its other uses. Zero where the pixel is empty.
     /// `[eq:gbuffer-normalise]`
-    #[inline]
-    pub fn pull(&self, d_features: &[f32; N], d_opacity: f32, d_depth: f32, normalise: bool) -> ([f32; N], f32, f32) {
+    #[inline(always)]
+    pub fn pull(&self, d_features: &[T; N], d_opacity: T, d_depth: T, normalise: bool) -> ([T; N], T, T) {
         let mut d_inverse_opacity = d_depth * self.depth;
-        if normalise {
-            d_inverse_opacity += d_features.iter().zip(&self.features).map(|(d, f)| d * f).sum::<f32>();
+        let mut d_sums = *d_features;
+        for i in 0..N {
+            if normalise {
+                d_inverse_opacity = d_inverse_opacity + d_features[i] * self.features[i];
+            }
+            d_sums[i] = (d_features[i] * self.weight).only_where(self.covered);
         }
-        let inverse = 1.0 / self.opacity;
-        (d_features.map(|d| d * self.weight), d_opacity - d_inverse_opacity * inverse, d_depth * inverse)
+        let inverse = self.opacity.inverse();
+        let d_opacity = (d_opacity - d_inverse_opacity * inverse).only_where(self.covered);
+        (d_sums, d_opacity, (d_depth * inverse).only_where(self.covered))
     }
 }
 
@@ -138,7 +148,7 @@ mod tests {
             let x: Vec<f64> = sums.iter().chain([&opacity, &depth]).map(|&v| f64::from(v)).collect();
             let cotangent: Vec<f64> = d.iter().map(|&v| f64::from(v)).collect();
             let expected = vjp(oracle, &x, &cotangent);
-            let blended = Blended::new(&sums, opacity, depth, normalise).expect("covered");
+            let blended = Blended::new(&sums, opacity, depth, normalise);
             let (s, o, z) = blended.pull(&[d[0], d[1], d[2]], d[3], d[4], normalise);
             let actual: Vec<f64> = s.iter().chain([&o, &z]).map(|&v| f64::from(v)).collect();
             prop_assert!(worst_relative(&actual, &expected, 1e-2 / f64::from(opacity)) <= 1e-4);
@@ -147,9 +157,9 @@ mod tests {
 
     #[test]
     fn empty_pixels_are_not_shaded() {
-        assert!(Blended::new(&[1.0], 0.0, 1.0, true).is_none());
-        assert!(Blended::new(&[1.0], f32::NAN, 1.0, true).is_none());
-        assert!(Blended::new(&[1.0], MIN_OPACITY, 1.0, true).is_some());
+        assert!(!Blended::new(&[1.0], 0.0, 1.0, true).covered);
+        assert!(!Blended::new(&[1.0], f32::NAN, 1.0, true).covered);
+        assert!(Blended::new(&[1.0], MIN_OPACITY, 1.0, true).covered);
     }
 
     #[test]

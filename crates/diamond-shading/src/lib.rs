@@ -50,10 +50,13 @@ mod error;
 mod fresnel;
 pub mod gbuffer;
 pub mod ggx;
+mod incidence;
 mod material;
 mod mlp;
 mod mlp_chunk;
 mod number;
+mod pixel_block;
+mod pixels;
 mod prepared;
 mod pseudo_normal;
 mod residual;
@@ -67,7 +70,7 @@ mod vector;
 
 pub use angles::{Angles, AnglesGrad, DirectionsGrad};
 pub use brdf::{BrdfModel, CosineFloor, Diffuse, ReflectGrad};
-pub use deferred::{Combine, IncidentModel, ShadePullback, ShadingConfig, SurfaceVisibility, shade};
+pub use deferred::{Combine, IncidentModel, ShadePullback, ShadingConfig, SurfaceVisibility, shade, shade_at};
 pub use encoding::{
     ENCODED_POSITION, ENCODING_FREQUENCIES, InputGradients, InputScaling, LIGHT_COLUMNS, LightDistanceInput,
     RESIDUAL_INPUTS, ResidualInputs, ResidualInputsGrad, ResidualInputsPullback, ScaleInput, positional_encoding,

@@ -1,15 +1,17 @@
 //! One view under many lights: what does not depend on the light is done once.
 use crate::ShadingError;
-use crate::deferred::{ShadingConfig, centre, features};
+use crate::deferred::ShadingConfig;
 use crate::error::check_image;
-use crate::gbuffer::{Blended, GBuffer, channel};
+use crate::gbuffer::{GBuffer, channel};
+use crate::pixel_block::{Planes, gather};
+use crate::pixels::{KEPT, LightRow, PrepareRow};
 use crate::row_chunks::map_chunks_mut;
-use crate::shaded::{RECORD, Shaded, record, unpack};
-use crate::surface_point::{GEOMETRY, SurfacePoint, TRANSPORT, Transport};
+use crate::shaded::{RECORD, Shaded, unpack};
+use crate::surface_point::{Eye, GEOMETRY, TRANSPORT};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
-use glam::Vec3;
+use diamond_simd::{BLOCK, Level};
 
 /// The light-independent half of a view, ready for any number of lights.
 ///
@@ -20,8 +22,8 @@ pub struct Prepared {
     width: usize,
     height: usize,
     config: ShadingConfig,
-    /// Point, opacity, and the factor of the blended features; `None` where the pixel is empty.
-    points: Vec<Option<(SurfacePoint, f32, f32)>>,
+    /// Blocks of each row, left to right.
+    blocks: Vec<Planes<KEPT>>,
 }
 
 impl Prepared {
@@ -33,18 +35,27 @@ impl Prepared {
         let channels = if gbuffer.features.channels() == GEOMETRY { GEOMETRY } else { channel::COUNT };
         let (width, height) = gbuffer.check(camera, channels)?;
         config.check()?;
-        let mut points = vec![None; width * height];
-        map_chunks_mut(&mut points, width, |y, row| {
-            for (x, out) in row.iter_mut().enumerate() {
-                let sums: [f32; GEOMETRY] = features(gbuffer.features.pixel(x, y), 0);
-                let (opacity, depth) = (gbuffer.opacity.pixel(x, y)[0], gbuffer.depth.pixel(x, y)[0]);
-                *out = Blended::new(&sums, opacity, depth, config.normalise).map(|blended| {
-                    let point = SurfacePoint::new(&blended.features, blended.depth, centre(x, y), camera, config);
-                    (point, blended.opacity, blended.weight)
-                });
-            }
+        let row = width.div_ceil(BLOCK);
+        let mut blocks = vec![[[0.0; BLOCK]; KEPT]; row * height];
+        let (level, eye) = (Level::current(), Eye::new(camera));
+        map_chunks_mut(&mut blocks, row, |y, out| level.dispatch(PrepareRow { gbuffer, eye: &eye, config, y, out }));
+        Ok(Self { width, height, config: *config, blocks })
+    }
+
+    /// The first `WIDTH` numbers of all records; `gather` fills the transport sums of the pixels from (x, y) on.
+    fn light<const WIDTH: usize>(
+        &self,
+        light: &OlatLight,
+        gather: impl Fn(&mut Planes<TRANSPORT>, usize, usize) + Sync,
+    ) -> Image {
+        let mut records = Image::new(self.width, self.height, WIDTH);
+        let (level, row, config) = (Level::current(), self.width.div_ceil(BLOCK), &self.config);
+        map_chunks_mut(records.data_mut(), self.width * WIDTH, |y, out| {
+            let kept = &self.blocks[y * row..(y + 1) * row];
+            let gather = |planes: &mut Planes<TRANSPORT>, x| gather(planes, x, y);
+            level.dispatch(LightRow::<WIDTH, _> { kept, light, config, gather, out });
         });
-        Ok(Self { width, height, config: *config, points })
+        records
     }
 
     /// Shades under one light; `transport` holds Σ w·f of the five light-dependent channels (residual, incident,
@@ -56,17 +67,11 @@ impl Prepared {
         if let Some(image) = transport {
             check_image("Prepared::shade: transport", image, (self.width, self.height, TRANSPORT))?;
         }
-        let mut records = Image::new(self.width, self.height, RECORD);
-        map_chunks_mut(records.data_mut(), self.width * RECORD, |y, row| {
-            for (x, out) in row.as_chunks_mut::<RECORD>().0.iter_mut().enumerate() {
-                let Some((point, opacity, weight)) = &self.points[y * self.width + x] else { continue };
-                let sums = transport.map_or([0.0; TRANSPORT], |image| features(image.pixel(x, y), 0));
-                let transport = Transport::new(&sums.map(|f| f * weight));
-                let lit = point.light(&transport, light, &self.config);
-                *out = record(point, &transport, &lit, *opacity);
+        Ok(unpack(&self.light::<RECORD>(light, |planes, x, y| {
+            if let Some(image) = transport {
+                gather(planes, image, 0, x, y);
             }
-        });
-        Ok(unpack(&records))
+        })))
     }
 
     /// The radiance alone under one light, with the bits of [`Prepared::shade`]. `transport` may hold the channels of
@@ -83,23 +88,14 @@ impl Prepared {
         let least = channels.end();
         let enough = transport.channels().max(least);
         check_image("Prepared::radiance: transport", transport, (self.width, self.height, enough))?;
-        let mut radiance = Image::new(self.width, self.height, 3);
-        map_chunks_mut(radiance.data_mut(), self.width * 3, |y, row| {
-            for (x, out) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                let Some((point, opacity, weight)) = &self.points[y * self.width + x] else { continue };
-                let pixel = transport.pixel(x, y);
-                let scalar = |c: Option<usize>| c.map_or(0.0, |c| pixel[c] * weight);
-                let residual = channels.residual.map_or(Vec3::ZERO, |c| Vec3::from_slice(&pixel[c..]) * *weight);
-                let transport = Transport {
-                    residual,
-                    incident: scalar(channels.incident),
-                    visibility: scalar(channels.visibility),
-                };
-                let lit = point.light(&transport, light, &self.config);
-                *out = (lit.surface * *opacity + lit.subsurface * *opacity).to_array();
+        let TransportChannels { residual, incident, visibility } = *channels;
+        Ok(self.light::<3>(light, |planes, x, y| {
+            for (range, first) in [(0..3, residual), (3..4, incident), (4..5, visibility)] {
+                if let Some(first) = first {
+                    gather(&mut planes[range], transport, first, x, y);
+                }
             }
-        });
-        Ok(radiance)
+        }))
     }
 }
 

@@ -1,9 +1,11 @@
 //! A shaded view: the radiance, the maps that it was made from, and the cotangents of both.
 use crate::ShadingError;
 use crate::error::check_image;
+use crate::number::Number;
+use crate::pixel_block::{Planes, gather};
 use crate::surface_point::{Lit, PointGrad, SurfacePoint, Transport};
+use crate::vector::Vector;
 use diamond_image::Image;
-use glam::Vec3;
 use std::ops::Range;
 
 /// What each pixel was shaded with, zero where it is empty. Divided by opacity (but see
@@ -95,26 +97,47 @@ mod place {
     pub const DEPTH: Range<usize> = 23..24;
 }
 
-/// One pixel's record.
-pub(crate) fn record(point: &SurfacePoint, transport: &Transport, lit: &Lit, opacity: f32) -> [f32; RECORD] {
-    let mut out = [0.0; RECORD];
-    let mut put = |range: Range<usize>, v: Vec3| out[range].copy_from_slice(&v.to_array());
+/// The records of one pixel or many, in the order of [`place`]; zero where `covered` is false.
+#[inline(always)]
+pub(crate) fn record<T: Number>(
+    point: &SurfacePoint<T>,
+    transport: &Transport<T>,
+    lit: &Lit<T>,
+    opacity: T,
+    covered: T::Mask,
+) -> [T; RECORD] {
     let (surface, subsurface) = (lit.surface * opacity, lit.subsurface * opacity);
-    put(place::RADIANCE, surface + subsurface);
-    put(place::SURFACE, surface);
-    put(place::SUBSURFACE, subsurface);
-    put(place::BASE_COLOR, point.material.base_color);
-    put(place::NORMAL, point.normal);
-    put(place::RESIDUAL, transport.residual);
-    for (range, v) in [
-        (place::ROUGHNESS, point.material.roughness),
-        (place::METALNESS, point.material.metalness),
-        (place::SUBSURFACENESS, point.subsurfaceness),
-        (place::INCIDENT, transport.incident),
-        (place::VISIBILITY, transport.visibility),
-        (place::DEPTH, point.depth),
-    ] {
-        out[range.start] = v;
+    let (c, s, u) = (surface + subsurface, surface, subsurface);
+    let (m, n, r) = (&point.material, point.normal, transport.residual);
+    let b = m.base_color;
+    let mut out = [
+        c.x,
+        c.y,
+        c.z,
+        s.x,
+        s.y,
+        s.z,
+        u.x,
+        u.y,
+        u.z,
+        b.x,
+        b.y,
+        b.z,
+        m.roughness,
+        m.metalness,
+        point.subsurfaceness,
+        n.x,
+        n.y,
+        n.z,
+        r.x,
+        r.y,
+        r.z,
+        transport.incident,
+        transport.visibility,
+        point.depth,
+    ];
+    for v in &mut out {
+        *v = v.only_where(covered);
     }
     out
 }
@@ -167,22 +190,35 @@ impl ShadedGrad {
         Ok(())
     }
 
-    /// The cotangents of one pixel.
-    pub(crate) fn at(&self, x: usize, y: usize) -> (Vec3, PointGrad) {
-        let scalar = |image: &Option<Image>| image.as_ref().map_or(0.0, |i| i.pixel(x, y)[0]);
-        let vector = |image: &Option<Image>| image.as_ref().map_or(Vec3::ZERO, |i| Vec3::from_slice(i.pixel(x, y)));
-        let m = &self.maps;
-        let maps = PointGrad {
-            base_color: vector(&m.base_color),
-            roughness: scalar(&m.roughness),
-            metalness: scalar(&m.metalness),
-            subsurfaceness: scalar(&m.subsurfaceness),
-            normal: vector(&m.normal),
-            residual: vector(&m.residual),
-            incident: scalar(&m.incident),
-            visibility: scalar(&m.visibility),
-            depth: scalar(&m.depth),
-        };
-        (vector(&self.radiance), maps)
+    /// The cotangents of the pixels of row `y` from `x` on, plane by plane in the order of [`cotangents`].
+    #[inline(always)]
+    pub(crate) fn gather(&self, planes: &mut Planes<COTANGENTS>, x: usize, y: usize) {
+        let mut first = 0;
+        for (_, image, channels) in self.parts() {
+            if let Some(image) = image {
+                gather(&mut planes[first..first + channels], image, 0, x, y);
+            }
+            first += channels;
+        }
     }
+}
+
+/// Cotangents of a pixel.
+pub(crate) const COTANGENTS: usize = 18;
+
+/// The cotangents of the radiance and the maps of one pixel or many.
+#[inline(always)]
+pub(crate) fn cotangents<T: Number>(d: [T; COTANGENTS]) -> (Vector<T>, PointGrad<T>) {
+    let maps = PointGrad {
+        base_color: Vector::new(d[3], d[4], d[5]),
+        roughness: d[6],
+        metalness: d[7],
+        subsurfaceness: d[8],
+        normal: Vector::new(d[9], d[10], d[11]),
+        residual: Vector::new(d[12], d[13], d[14]),
+        incident: d[15],
+        visibility: d[16],
+        depth: d[17],
+    };
+    (Vector::new(d[0], d[1], d[2]), maps)
 }
