@@ -12,7 +12,8 @@
 //! radiance is linear RGB; α is the square of the roughness. Gradients with respect to unit vectors are those of free
 //! vectors: their part along the vector is meaningless and vanishes in the pullback of whatever normalised it.
 //!
-//! Features: `parallel` spreads rows and chunks over threads, `simd` widens the network's products. Both are off by default.
+//! Deferred shading and the network run on the process's instruction set (`diamond-simd`), chosen at run time. The feature
+//! `parallel`, off by default, spreads rows and chunks over threads.
 //!
 //! ```
 //! use diamond_camera::{Camera, Intrinsics, Pose};
