@@ -40,6 +40,8 @@ pub struct Config {
     pub adam: Adam,
     /// Adam's learning rates.
     pub rates: Rates,
+    /// Gains between rendered radiance and photographs.
+    pub exposure: ExposureSettings,
     /// Surface shading.
     pub shading: Shading,
     /// Subsurface residual.
@@ -262,6 +264,46 @@ pub struct Rates {
     pub network_final: f32,
     /// All Gaussian attributes but the mean fall log-linearly to this fraction of their rate at the end of the run.
     pub attribute_final: f32,
+}
+
+/// What has a gain of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureMode {
+    /// Nothing: photographs are radiance.
+    Fixed,
+    /// All photographs together; renderings have the gain.
+    Global,
+    /// Each view; the gains' geometric mean is 1, and renderings have gain 1.
+    PerView,
+    /// Each photograph; the gains' geometric mean is 1, and renderings have gain 1.
+    PerImage,
+}
+
+/// How the unit of light is first chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FirstExposure {
+    /// All but the brightest per cent of the photographs' foreground is at most white under the light.
+    Highlights,
+    /// The first renderings have the mean of the photographs.
+    Mean,
+}
+
+/// Gains between rendered radiance and photographs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExposureSettings {
+    /// What has a gain of its own.
+    pub mode: ExposureMode,
+    /// Whether red, green and blue have gains of their own.
+    pub per_channel: bool,
+    /// Largest step of the logarithm of a gain; falls as the rates of the Gaussians' attributes do.
+    pub rate: f32,
+    /// Pull of a gain's logarithm toward 0, over its largest step.
+    pub prior: f32,
+    /// How the unit of light is first chosen.
+    pub first: FirstExposure,
 }
 
 /// Masking–shadowing variant.
@@ -654,6 +696,8 @@ impl Config {
         }
         let d = &self.density;
         let not_negative = [
+            ("exposure.rate", self.exposure.rate),
+            ("exposure.prior", self.exposure.prior),
             ("density.gradient_threshold", d.gradient_threshold),
             ("density.percent_dense", d.percent_dense),
             ("density.max_screen_radius", d.max_screen_radius),

@@ -1,6 +1,7 @@
 //! The CPU engine: one training step, written out in order.
 //!
 //! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
+use crate::exposure::GainGrad;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
@@ -185,6 +186,7 @@ impl Engine for CpuEngine {
         let mut psnr = 0.0;
         let mut visible = 0;
         self.profile.add("activate", start);
+        let mut gains: Vec<(usize, GainGrad)> = Vec::new();
         let share = 1.0 / batch.len().max(1) as f32;
         let needs = self.needs.at(plan);
         for pair in batch {
@@ -213,9 +215,11 @@ impl Engine for CpuEngine {
                 needs: &needs,
             };
             let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
+            let gain = self.model.exposure.index(self.model.config.exposure.mode, pair.view, pair.image);
+            let gain_value = gain.map(|i| self.model.exposure.gain(i));
             let mut outcome = None;
             let pulled = forward::value_and_grad(&pass, &mut meters, |view| {
-                let mut o = objective::evaluate(&self.model.config, &needs, view, pair, share)?;
+                let mut o = objective::evaluate(&self.model.config, &needs, view, pair, share, gain_value)?;
                 let grad = std::mem::take(&mut o.grad);
                 outcome = Some(o);
                 Ok(grad)
@@ -225,6 +229,12 @@ impl Engine for CpuEngine {
                 self.counters.add("PSNR encoded anew", usize::from(outcome.psnr_encoded));
                 terms.add(&outcome.terms, share);
                 psnr += outcome.psnr * share;
+                if let Some(i) = gain {
+                    if !gains.iter().any(|(j, _)| *j == i) {
+                        gains.push((i, GainGrad::default()));
+                    }
+                    gains.iter_mut().filter(|(j, _)| *j == i).for_each(|(_, d)| d.add(&outcome.gain, share));
+                }
             }
             visible = pulled.visible;
             let t = Instant::now();
@@ -267,6 +277,16 @@ impl Engine for CpuEngine {
         }
         let t = Instant::now();
         self.apply(step, plan, &activated, &total, &network_grad)?;
+        for (i, d) in gains {
+            if !d.log_gain.is_finite() || !d.weight.is_finite() {
+                return Err(ReconstructError::NonFinite {
+                    what: "the gradient of a photograph's gain".into(),
+                    step,
+                    detail: format!("gain {i}: {}", d.log_gain),
+                });
+            }
+            self.model.exposure.step(&self.model.config, i, &d, plan.attribute_factor);
+        }
         let t = self.profile.add("adam", t);
         let density = self.control_density(step, plan)?;
         self.profile.add("density control", t);
@@ -306,6 +326,10 @@ impl Engine for CpuEngine {
             file.insert(format!("network.{name}.second_moment"), &shape, moments.second.clone());
         }
         self.visibility.store(&mut file);
+        let exposure = &self.model.exposure;
+        if !exposure.names.is_empty() {
+            file.insert("exposure.log_gain", &[exposure.names.len(), 3], exposure.log_gains.clone());
+        }
         // Counts are far below 2²⁴, so f32 holds them exactly.
         let views = self.stats.views.iter().map(|&v| v as f32).collect();
         file.insert("density.gradient_sum", &[n], self.stats.gradient_sum.clone());
@@ -333,6 +357,11 @@ impl Engine for CpuEngine {
                 moments.first = state.take(path, &format!("network.{name}.first_moment"), size)?;
                 moments.second = state.take(path, &format!("network.{name}.second_moment"), size)?;
             }
+        }
+        let exposure = &mut self.model.exposure;
+        let gains = exposure.names.len();
+        if gains > 0 {
+            exposure.log_gains = state.take(path, "exposure.log_gain", 3 * gains)?;
         }
         self.stats = DensityStats {
             gradient_sum: state.take(path, "density.gradient_sum", n)?,

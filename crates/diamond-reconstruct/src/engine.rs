@@ -23,6 +23,10 @@ pub struct TrainingPair<'a> {
     pub weight: f32,
     /// The rectangle outside of which `radiance` and `mask` are 0 everywhere; `None` where they are so altogether.
     pub content: Option<Region>,
+    /// Index of the training view.
+    pub view: usize,
+    /// Index of the photograph among all training photographs.
+    pub image: usize,
 }
 
 /// What one training step did.
@@ -47,7 +51,7 @@ pub struct StepReport {
 /// A view under one light.
 #[derive(Debug, Clone)]
 pub struct Rendering {
-    /// Linear RGB over black.
+    /// Linear RGB over black, times the global gain where exposure has one.
     pub radiance: Image,
     /// Surface part, linear RGB over black.
     pub surface: Image,

@@ -4,8 +4,8 @@ use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::tensor_file::write_atomically;
 use crate::{
-    Attribute, Config, Covariance, GaussianParameters, InitialNormals, Layout, MetalVariant, ReconstructError,
-    Renderer, Rendering, Scene, TensorFile, error, logit,
+    Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout,
+    MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
@@ -23,6 +23,8 @@ pub struct Model {
     pub network: Option<ResidualNetwork>,
     /// Adam moments of the network: trunk, residual head, incident head.
     pub network_moments: [Moments; 3],
+    /// Gains of the photographs.
+    pub exposure: Exposure,
     /// Where the object is and how bright the lights are.
     pub scene: Scene,
     /// The configuration that it was made with.
@@ -33,6 +35,9 @@ pub struct Model {
 const MIN_INITIAL_SCALE: f32 = 1e-4;
 /// Largest initial standard deviation, × scene radius: lone points would otherwise cover the image.
 const MAX_INITIAL_SCALE: f32 = 0.1;
+
+/// Gains of the photographs, in a run's folder.
+const EXPOSURE_FILE: &str = "exposure.toml";
 
 /// The network's shape under a configuration.
 pub(crate) fn network_config(config: &Config) -> ResidualNetworkConfig {
@@ -95,7 +100,8 @@ impl Model {
             false => None,
         };
         let network_moments = network_moments(network.as_ref());
-        Ok(Self { parameters, network, network_moments, scene, config: config.clone() })
+        let exposure = Exposure::default();
+        Ok(Self { parameters, network, network_moments, exposure, scene, config: config.clone() })
     }
 
     /// Renders one camera under each light, with all maps. For several cameras or for the radiance alone see [`Renderer`].
@@ -113,7 +119,8 @@ impl Model {
         self.parameters.is_empty()
     }
 
-    /// Writes `model.ply` (standard 3DGS attributes and ours), `network.safetensors`, `scene.toml` and `config.toml`.
+    /// Writes `model.ply` (standard 3DGS attributes and ours), `network.safetensors`, `scene.toml`,
+    /// `config.toml`, and `exposure.toml` where gains were learned.
     pub fn save(&self, folder: &Path) -> Result<(), ReconstructError> {
         std::fs::create_dir_all(folder).map_err(|source| ReconstructError::Io {
             path: folder.to_owned(),
@@ -125,6 +132,11 @@ impl Model {
         let scene = toml::to_string_pretty(&self.scene)
             .map_err(|e| ReconstructError::Config { origin: "scene".into(), detail: e.to_string() })?;
         write_atomically(&folder.join("scene.toml"), scene.as_bytes())?;
+        if self.config.exposure.mode != ExposureMode::Fixed {
+            let text = toml::to_string_pretty(&self.exposure.to_file())
+                .map_err(|e| ReconstructError::Config { origin: "exposure".into(), detail: e.to_string() })?;
+            write_atomically(&folder.join(EXPOSURE_FILE), text.as_bytes())?;
+        }
         let mut file = TensorFile::default();
         for (name, values) in self.network_tensors() {
             file.insert(name, &[values.len()], values.to_vec());
@@ -150,8 +162,19 @@ impl Model {
         let table =
             read_ply(&path).map_err(|e| ReconstructError::Checkpoint { path: path.clone(), detail: e.to_string() })?;
         let parameters = from_ply(&table, &config, &path)?;
-        let mut model =
-            Self { parameters, network: None, network_moments: Default::default(), scene, config: config.clone() };
+        let mut model = Self {
+            parameters,
+            network: None,
+            network_moments: Default::default(),
+            exposure: Exposure::default(),
+            scene,
+            config: config.clone(),
+        };
+        if config.exposure.mode != ExposureMode::Fixed {
+            let file: ExposureFile = toml::from_str(&read(EXPOSURE_FILE)?)
+                .map_err(|e| ReconstructError::Config { origin: EXPOSURE_FILE.into(), detail: e.to_string() })?;
+            model.exposure = Exposure::from_file(&file);
+        }
         if config.residual.network {
             let mut network =
                 ResidualNetwork::initialise(&network_config(&config), &mut || 0.5).map_err(error::stage("network"))?;

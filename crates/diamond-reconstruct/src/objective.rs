@@ -3,6 +3,7 @@
 //! Terms are computed on the region of the picture that is not empty. They are means over pixels, so that the mean over
 //! the picture is the mean over the region times the region's share of the pixels, plus, for the mask's cross-entropy,
 //! what an empty pixel costs there.
+use crate::exposure::{GainGrad, expose, expose_pull};
 use crate::forward::{PairGrad, View, ViewGrad};
 use crate::needs::StepNeeds;
 use crate::random::Random;
@@ -61,6 +62,8 @@ pub struct Outcome {
     pub psnr: f32,
     /// Whether both pictures were encoded once more for it.
     pub psnr_encoded: bool,
+    /// Gradient of the logarithm of the photograph's gain; zero without one.
+    pub gain: GainGrad,
 }
 
 fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
@@ -88,13 +91,15 @@ fn empty_pixel_entropy() -> f64 {
     -(1.0 - diamond_losses::OPACITY_MARGIN).ln()
 }
 
-/// Value and gradient of every image term for one pair, with weight `share` in the batch.
+/// Value and gradient of every image term for one pair, with weight `share` in the batch. The photographic terms see the
+/// rendering under `gain`, if any.
 pub fn evaluate(
     config: &Config,
     needs: &StepNeeds,
     view: &View<'_>,
     pair: &TrainingPair<'_>,
     share: f32,
+    gain: Option<Vec3>,
 ) -> Result<Outcome, ReconstructError> {
     let loss = &config.loss;
     let (shaded, maps) = (view.shaded, &view.shaded.maps);
@@ -116,14 +121,20 @@ pub fn evaluate(
         space: loss.space.transfer(),
         window: SsimWindow::ZeroPadded,
     };
+    let exposed = gain.map(|g| expose(&shaded.radiance, g));
+    let rendered = exposed.as_ref().unwrap_or(&shaded.radiance);
     let weight = pair.weight;
-    let photometric = diamond_losses::photometric(&shaded.radiance, &target, &options, weight).map_err(&fail)?;
+    let mut photometric = diamond_losses::photometric(rendered, &target, &options, weight).map_err(&fail)?;
     terms.push(TermValue { name: "l1", weight: weight * (1.0 - loss.ssim), value: part(photometric.l1) });
     if needs.window {
         terms.push(TermValue { name: "dssim", weight: weight * loss.ssim, value: part(photometric.dssim) });
     }
     if loss.l2 > 0.0 {
         terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: part(photometric.l2) });
+    }
+    let mut d_gain = GainGrad::default();
+    if let (Some(gain), Some(exposed)) = (gain, &exposed) {
+        d_gain = expose_pull(exposed, gain, &mut photometric.grad);
     }
     // Gradients of means over the region become those of means over the picture with the share of the batch.
     let scale = part(share);
@@ -202,9 +213,9 @@ pub fn evaluate(
     let known = photometric.display_error.filter(|_| !needs.own_psnr);
     let error = match known {
         Some(error) => f64::from(error),
-        None => display_error(&shaded.radiance, &target)?,
+        None => display_error(rendered, &target)?,
     };
-    Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none() })
+    Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none(), gain: d_gain })
 }
 
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.

@@ -1,11 +1,12 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
+use crate::exposure;
 use crate::pairs::PairOrder;
 use crate::region::Region;
 use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
 use crate::{
-    CaptureFacts, Config, CpuEngine, Engine, Model, Needs, ReconstructError, Rendering, Scene, StepPlan, StepReport,
-    TrainingPair,
+    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Model, Needs, ReconstructError, Rendering, Scene,
+    StepPlan, StepReport, TrainingPair,
 };
 use diamond_camera::Camera;
 use diamond_dataset::{Capture, Observation};
@@ -53,7 +54,12 @@ impl Reconstruction {
         points: &InitialPoints,
         needs: Option<Needs>,
     ) -> Result<Self, ReconstructError> {
-        let model = Model::initial(config, scene, points)?;
+        let mut model = Model::initial(config, scene, points)?;
+        model.exposure = Exposure::new(config, &capture);
+        // A resumed run has no points here, and its light unit in the checkpoint.
+        if config.exposure.first == FirstExposure::Mean && !model.is_empty() {
+            exposure::match_mean(&mut model, &capture)?;
+        }
         let pairs: Vec<(usize, usize)> =
             capture.train.iter().enumerate().flat_map(|(v, view)| (0..view.shots.len()).map(move |s| (v, s))).collect();
         if pairs.is_empty() {
@@ -197,18 +203,19 @@ impl Reconstruction {
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
         let plan = StepPlan::new(&self.config, self.step);
         let batch = self.config.accumulate as u64;
-        let mut loaded: Vec<(usize, usize, Option<Region>, Arc<Observation>)> = Vec::with_capacity(batch as usize);
+        let mut loaded: Vec<(usize, usize, usize, Option<Region>, Arc<Observation>)> =
+            Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let pair = self.order.at(self.step * batch + k);
             let (v, s) = self.pairs[pair];
             let observation = self.capture.observation(&self.capture.train[v].shots[s])?;
             let look = || Region::of_photograph(&observation.radiance, observation.mask.as_ref());
             let content = *self.contents[pair].get_or_insert_with(look);
-            loaded.push((v, s, content, observation));
+            loaded.push((v, s, pair, content, observation));
         }
         let pairs: Vec<TrainingPair<'_>> = loaded
             .iter()
-            .map(|(v, s, content, observation)| {
+            .map(|(v, s, pair, content, observation)| {
                 let view = &self.capture.train[*v];
                 TrainingPair {
                     camera: &view.camera,
@@ -217,6 +224,8 @@ impl Reconstruction {
                     mask: observation.mask.as_ref(),
                     weight: view.shots[*s].weight,
                     content: *content,
+                    view: *v,
+                    image: *pair,
                 }
             })
             .collect();

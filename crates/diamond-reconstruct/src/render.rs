@@ -8,6 +8,7 @@
 //!
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
+use crate::exposure::expose;
 use crate::forward::{Settings, raster_config};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
@@ -23,6 +24,7 @@ use diamond_shading::{
     GBuffer, ManyLights, Prepared, Shaded, ShadedMaps, TransportChannels, channel, transfer_radiance,
 };
 use diamond_splat::{Features, Projection, Raster, RasterGrad, project, rasterize_projected};
+use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
@@ -91,7 +93,7 @@ impl<'m> Renderer<'m> {
                 };
                 let light = self.model.scene.scaled_light(light);
                 let part = view.prepared.radiance(&light, transport, &channels).map_err(error::stage("shade"))?;
-                Ok(view.region.paste(&part, width, height))
+                Ok(view.region.paste(&self.exposed(part), width, height))
             });
             out.extend(images.collect::<Result<Vec<_>, ReconstructError>>()?);
             Ok(())
@@ -109,7 +111,10 @@ impl<'m> Renderer<'m> {
             for (k, light) in lights.iter().enumerate() {
                 let transport = transport.channels_range(k * per_light..(k + 1) * per_light);
                 let light = self.model.scene.scaled_light(light);
-                let shaded = view.prepared.shade(&light, Some(&transport)).map_err(error::stage("shade"))?;
+                let mut shaded = view.prepared.shade(&light, Some(&transport)).map_err(error::stage("shade"))?;
+                shaded.radiance = self.exposed(shaded.radiance);
+                shaded.surface = self.exposed(shaded.surface);
+                shaded.subsurface = self.exposed(shaded.subsurface);
                 out.push(rendering(shaded, &view.region, &view.opacity, width, height));
             }
             Ok(())
@@ -129,6 +134,12 @@ impl<'m> Renderer<'m> {
             pixels: view.size.0 * view.size.1,
             shaded: view.region.pixels(),
         })
+    }
+
+    /// Under the global gain, where exposure has one.
+    fn exposed(&self, image: Image) -> Image {
+        let gain = self.model.exposure.of_renderings(self.model.config.exposure.mode);
+        if gain == Vec3::ONE { image } else { expose(&image, gain) }
     }
 
     fn tracer(&self) -> Result<&Tracer, ReconstructError> {

@@ -137,5 +137,13 @@ fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {
         (_, _, _, Some(n)) => LightChoice::Dome(n),
         _ => LightChoice::Training,
     };
-    Ok(RenderOptions { folder: a.dir, output: a.output, cameras, lights, size: a.size, linear: a.linear })
+    Ok(RenderOptions {
+        folder: a.dir,
+        output: a.output,
+        cameras,
+        lights,
+        size: a.size,
+        linear: a.linear,
+        exposure: a.exposure,
+    })
 }

@@ -140,6 +140,7 @@ const RESULTS: [&str; 14] = [
     "model.ply",
     "config.toml",
     "scene.toml",
+    "exposure.toml",
     "network.safetensors",
     "metrics.json",
     "metrics.csv",

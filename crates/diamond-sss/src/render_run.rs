@@ -23,6 +23,8 @@ pub struct RenderOptions {
     pub size: Option<(u32, u32)>,
     /// Linear light as EXR instead of sRGB as PNG.
     pub linear: bool,
+    /// Stops by which pictures are brighter than the model says; every stop doubles the radiance.
+    pub exposure: f32,
 }
 
 /// Renders and writes the pictures; returns their paths. Calls `progress` with pictures done and all.
@@ -59,7 +61,9 @@ pub fn render_folder(
                 _ => format!("{camera}_{light}.{extension}"),
             })
         };
-        let bytes = if options.linear { encode_exr(picture)? } else { encode_png_linear(picture)? };
+        let gain = options.exposure.exp2();
+        let exposed = if gain == 1.0 { picture.clone() } else { picture.map(|v| v * gain) };
+        let bytes = if options.linear { encode_exr(&exposed)? } else { encode_png_linear(&exposed)? };
         write_output(&path, &bytes)?;
         written.push(path);
         progress(written.len(), total);

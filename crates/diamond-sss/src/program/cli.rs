@@ -235,9 +235,19 @@ pub struct RenderArguments {
     /// Linear light as EXR instead of sRGB as PNG
     #[arg(long)]
     pub linear: bool,
+    /// Brighter by so many stops (each doubles the light), or darker if negative
+    #[arg(long, value_name = "EV", default_value_t = 0.0, allow_hyphen_values = true, value_parser = stops)]
+    pub exposure: f32,
     /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: auto]
     #[arg(long, value_name = "NAME")]
     pub instruction_set: Option<InstructionChoice>,
+}
+
+fn stops(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(ev) if (-20.0..=20.0).contains(&ev) => Ok(ev),
+        _ => Err("expected a number from -20 to 20".into()),
+    }
 }
 
 fn at_least_one(text: &str) -> Result<usize, String> {

@@ -1,0 +1,151 @@
+//! Gains of photographs: known ones are found again without harm to the model, they resume to the bit and survive files;
+//! the first exposure matches the photographs.
+use diamond_dataset::{Capture, Observation, OpenOptions, Selection};
+use diamond_reconstruct::random::{Purpose, Random};
+use diamond_reconstruct::{
+    Config, CpuEngine, Engine, ExposureMode, FirstExposure, Model, Reconstruction, Region, StepPlan, TrainingPair,
+};
+use std::sync::Arc;
+
+fn capture(views: usize, lights: usize) -> Capture {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/captures/spot-small");
+    Capture::open(folder.as_ref(), &OpenOptions::default())
+        .and_then(|c| c.select(&Selection::Count(views), &Selection::Count(lights)))
+        .expect("the embedded capture opens")
+}
+
+fn config(mode: ExposureMode, steps: u64) -> Config {
+    let mut config = Config::preset("resolved").expect("a preset");
+    config.steps = steps;
+    config.initial.count = 1000;
+    config.exposure.mode = mode;
+    config.density.strategy = diamond_reconstruct::DensityStrategy::None;
+    config
+}
+
+/// Trains `model` on photographs × gains.
+fn train(model: Model, capture: &Capture, gains: &[f32]) -> Model {
+    let config = model.config.clone();
+    let mut engine = CpuEngine::new(model);
+    let shots: Vec<_> =
+        capture.train.iter().enumerate().flat_map(|(v, view)| view.shots.iter().map(move |s| (v, s))).collect();
+    let observations: Vec<Arc<Observation>> =
+        shots.iter().map(|(_, s)| capture.observation(s).expect("an image")).collect();
+    let scaled: Vec<_> = observations.iter().zip(gains).map(|(o, g)| o.radiance.map(|v| v * g)).collect();
+    let mut order = Vec::new();
+    for step in 0..config.steps {
+        if order.is_empty() {
+            order = Random::new(config.seed, Purpose::Pairs, step).permutation(shots.len());
+        }
+        let image = order.pop().expect("not empty") as usize;
+        let (view, shot) = shots[image];
+        let pair = TrainingPair {
+            camera: &capture.train[view].camera,
+            light: &shot.light,
+            radiance: &scaled[image],
+            mask: observations[image].mask.as_ref(),
+            weight: 1.0,
+            content: Region::of_photograph(&scaled[image], observations[image].mask.as_ref()),
+            view,
+            image,
+        };
+        engine.training_step(step, &StepPlan::new(&config, step), &[pair]).expect("a step");
+    }
+    engine.model().expect("a model").clone()
+}
+
+/// A model that was trained on the photographs as they are, and is now held fixed, tells gains from content. (After 300
+/// steps instead of 900 gains are off by 14 % even where all are 1: they take up what the model cannot explain yet.)
+#[test]
+fn known_gains_are_found_again_where_the_model_is_known() {
+    let capture = capture(4, 3);
+    let images = 12;
+    let mut random = Random::new(3, Purpose::Initial, 0);
+    let mut logs: Vec<f32> = (0..images).map(|_| 0.3 * random.normal()).collect();
+    let mean = logs.iter().sum::<f32>() / images as f32;
+    logs.iter_mut().for_each(|g| *g -= mean);
+    let gains: Vec<f32> = logs.iter().map(|g| g.exp()).collect();
+    let start = config(ExposureMode::PerImage, 900);
+    let mut model = Reconstruction::new(capture.clone(), &start).expect("starts").model().expect("a model").clone();
+    model.config.exposure.rate = 0.0;
+    let mut model = train(model, &capture, &vec![1.0; images]);
+    assert!(model.exposure.log_gains.iter().all(|g| *g == 0.0), "a rate of 0 moves nothing");
+    let c = &mut model.config;
+    c.steps = 30 * images as u64;
+    c.exposure.rate = 0.3;
+    c.exposure.prior = 0.0;
+    let r = &mut c.rates;
+    for rate in [
+        &mut r.mean,
+        &mut r.mean_final,
+        &mut r.scale,
+        &mut r.rotation,
+        &mut r.opacity,
+        &mut r.normal,
+        &mut r.material,
+        &mut r.visibility_sh,
+        &mut r.transfer,
+        &mut r.codes,
+        &mut r.network,
+        &mut r.network_final,
+    ] {
+        *rate = 0.0;
+    }
+    c.shading.roughness_unfreeze = 0.0;
+    let learned = train(model, &capture, &gains);
+    let errors: Vec<f32> =
+        gains.iter().enumerate().map(|(i, g)| (learned.exposure.gain(i).x / g - 1.0).abs()).collect();
+    let worst = errors.iter().copied().fold(0.0, f32::max);
+    let typical = errors.iter().sum::<f32>() / images as f32;
+    println!("gains: worst {worst:.4}, mean {typical:.4}");
+    assert!(typical < 0.02 && worst < 0.06, "gains are off by {typical} in the mean, {worst} at worst");
+}
+
+#[test]
+fn gains_resume_with_the_same_bits_and_survive_files() {
+    for mode in [ExposureMode::PerView, ExposureMode::PerImage, ExposureMode::Global] {
+        let config = config(mode, 20);
+        let dir = std::env::temp_dir().join(format!("diamond-exposure-{mode:?}-{}", std::process::id()));
+        let mut whole = Reconstruction::new(capture(2, 2), &config).expect("starts");
+        for step in 0..20 {
+            whole.step().expect("a step");
+            if step == 8 {
+                whole.save_checkpoint(&dir).expect("a checkpoint");
+            }
+        }
+        let mut resumed = Reconstruction::resume(capture(2, 2), &config, &dir).expect("resumes");
+        while !resumed.finished() {
+            resumed.step().expect("a step");
+        }
+        let (a, b) = (whole.model().expect("a model").clone(), resumed.model().expect("a model").clone());
+        assert!(a.exposure == b.exposure && a.parameters == b.parameters, "{mode:?}: the resumed run differs");
+        assert!(a.exposure.log_gains.iter().any(|g| *g != 0.0));
+        a.save(&dir).expect("saved");
+        let loaded = Model::load(&dir).expect("loaded");
+        let view = whole.capture().train[0].clone();
+        let render = |m: &Model| m.render(&view.camera, &[view.shots[0].light]).expect("renders").remove(0).radiance;
+        let (before, after) = (render(&a), render(&loaded));
+        let worst = before.data().iter().zip(after.data()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-6, "{mode:?}: {worst}");
+        std::fs::remove_dir_all(dir).expect("removed");
+    }
+}
+
+/// `[eq:first-exposure]`
+#[test]
+fn the_first_rendering_is_as_bright_as_the_photographs() {
+    let capture = capture(3, 2);
+    let mut config = config(ExposureMode::Fixed, 10);
+    config.exposure.first = FirstExposure::Mean;
+    let mut run = Reconstruction::new(capture.clone(), &config).expect("starts");
+    let model = run.model().expect("a model");
+    let (mut target, mut rendered) = (0.0, 0.0);
+    for view in &capture.train {
+        for shot in &view.shots {
+            let sum = |image: &diamond_image::Image| image.data().iter().map(|v| f64::from(*v)).sum::<f64>();
+            target += sum(&capture.observation(shot).expect("an image").radiance);
+            rendered += sum(&model.render(&view.camera, &[shot.light]).expect("renders").remove(0).radiance);
+        }
+    }
+    assert!((rendered / target - 1.0).abs() < 0.01, "{rendered} {target}");
+}
