@@ -136,7 +136,7 @@ struct Costs {
 const COSTS_FILE: &str = "costs.json";
 
 /// Files and folders that a run writes; `--force` removes these and nothing else.
-const RESULTS: [&str; 14] = [
+const RESULTS: [&str; 15] = [
     "model.ply",
     "config.toml",
     "scene.toml",
