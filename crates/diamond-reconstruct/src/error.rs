@@ -58,7 +58,9 @@ impl std::fmt::Display for ReconstructError {
             Self::Config { origin, detail } => write!(f, "configuration {origin}: {detail}"),
             Self::Capture(e) => write!(f, "{e}"),
             Self::Unusable { detail } => write!(f, "{detail}"),
-            Self::Io { path, action, source } => write!(f, "{}: could not {action}: {source}", path.display()),
+            Self::Io { path, action, source } => {
+                write!(f, "{}: could not {action}: {source}{}", path.display(), io_advice(source))
+            }
             Self::Checkpoint { path, detail } => write!(f, "{}: {detail}", path.display()),
             Self::NonFinite { what, step, detail } => write!(
                 f,
@@ -67,6 +69,26 @@ impl std::fmt::Display for ReconstructError {
             ),
             Self::Internal { stage, detail } => write!(f, "stage {stage}: {detail}"),
         }
+    }
+}
+
+/// What to do about an answer of the operating system, to be appended to a message; empty where there is nothing to say.
+pub fn io_advice(source: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind;
+    match source.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+            "; free some space and run the same command again (an interrupted reconstruction with --resume: what was \
+             written before is intact)"
+        }
+        ErrorKind::FileTooLarge => {
+            "; raise the limit on the size of files (ulimit -f) or write to another disk, then run the same command \
+             again (an interrupted reconstruction with --resume: what was written before is intact)"
+        }
+        ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
+            "; check who may use the file and its folder, or name another place"
+        }
+        ErrorKind::NotADirectory => "; a part of this path is a file and no folder: name another place",
+        _ => "",
     }
 }
 

@@ -2,15 +2,14 @@
 use crate::adam::Moments;
 use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
-use crate::tensor_file::write_atomically;
 use crate::{
     Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout,
-    MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit,
+    MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit, write_atomically,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
 use diamond_shading::{Activation, Mlp, ResidualNetwork, ResidualNetworkConfig};
-use diamond_splat::{PlyTable, ScalarType, mean_squared_distance_to_nearest, read_ply, write_ply};
+use diamond_splat::{PlyFormat, PlyTable, ScalarType, mean_squared_distance_to_nearest, ply_bytes, read_ply};
 use glam::{Quat, Vec3};
 use std::path::Path;
 
@@ -127,7 +126,8 @@ impl Model {
             action: "create the folder",
             source,
         })?;
-        write_ply(folder.join("model.ply"), &self.to_ply()).map_err(error::stage("model.ply"))?;
+        let table = ply_bytes(&self.to_ply(), PlyFormat::BinaryLittleEndian).map_err(error::stage("model.ply"))?;
+        write_atomically(&folder.join("model.ply"), &table)?;
         write_atomically(&folder.join("config.toml"), self.config.to_toml()?.as_bytes())?;
         let scene = toml::to_string_pretty(&self.scene)
             .map_err(|e| ReconstructError::Config { origin: "scene".into(), detail: e.to_string() })?;

@@ -2,7 +2,6 @@
 use crate::ReconstructError;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
-use std::io::Write;
 use std::path::Path;
 
 /// Metadata key under which the SHA-256 of all tensor bytes is stored.
@@ -17,25 +16,18 @@ pub struct TensorFile {
     pub metadata: BTreeMap<String, String>,
 }
 
-/// Writes `bytes` to `path` through a temporary file in the same folder: written, synced, renamed.
+/// Writes `bytes` to `path` whole or not at all, see [`diamond_splat::write_whole`].
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ReconstructError> {
-    let fail = |action| move |source| ReconstructError::Io { path: path.to_owned(), action, source };
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".tmp");
-    let temporary = path.with_file_name(name);
-    let mut file = std::fs::File::create(&temporary).map_err(fail("create a temporary file beside it"))?;
-    file.write_all(bytes).map_err(fail("write"))?;
-    file.sync_all().map_err(fail("sync"))?;
-    drop(file);
-    std::fs::rename(&temporary, path).map_err(fail("rename the temporary file onto it"))?;
-    if let Some(folder) = path.parent().and_then(|p| std::fs::File::open(p).ok()) {
-        // Makes the rename itself durable; not every file system can, and the file is whole either way.
-        let _ = folder.sync_all();
-    }
-    Ok(())
+    diamond_splat::write_whole(path, bytes).map_err(|failure| ReconstructError::Io {
+        path: path.to_owned(),
+        action: failure.action,
+        source: failure.source,
+    })
 }
 
-fn digest<'a>(tensors: impl Iterator<Item = (&'a String, &'a [u8])>) -> String {
+/// SHA-256 in lower-case hex of tensors' names, lengths and bytes, in the order of their names: what a file holds of
+/// itself to be known as whole.
+pub fn tensor_digest<'a>(tensors: impl Iterator<Item = (&'a String, &'a [u8])>) -> String {
     use sha2::{Digest, Sha256};
     let mut hash = Sha256::new();
     for (name, bytes) in tensors {
@@ -53,8 +45,13 @@ impl TensorFile {
         self.tensors.insert(name.into(), (shape.to_vec(), values));
     }
 
-    /// Writes the file atomically.
+    /// Writes the file, whole or not at all.
     pub fn write(&self, path: &Path) -> Result<(), ReconstructError> {
+        write_atomically(path, &self.to_bytes(path)?)
+    }
+
+    /// The bytes of the file; `path` is only named in errors.
+    pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, ReconstructError> {
         let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
         let bytes: BTreeMap<&String, Vec<u8>> = self
             .tensors
@@ -62,37 +59,41 @@ impl TensorFile {
             .map(|(name, (_, values))| (name, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
             .collect();
         let mut metadata: HashMap<String, String> = self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
-        metadata.insert(DIGEST_KEY.into(), digest(bytes.iter().map(|(n, b)| (*n, b.as_slice()))));
+        metadata.insert(DIGEST_KEY.into(), tensor_digest(bytes.iter().map(|(n, b)| (*n, b.as_slice()))));
         let mut views = Vec::with_capacity(bytes.len());
         for (name, data) in &bytes {
             let shape = self.tensors[*name].0.clone();
             views.push((*name, TensorView::new(Dtype::F32, shape, data).map_err(|e| fail(e.to_string()))?));
         }
-        let out = safetensors::serialize(views, Some(metadata)).map_err(|e| fail(e.to_string()))?;
-        write_atomically(path, &out)
+        safetensors::serialize(views, Some(metadata)).map_err(|e| fail(e.to_string()))
     }
 
     /// Reads and verifies a file that [`TensorFile::write`] wrote.
     pub fn read(path: &Path) -> Result<Self, ReconstructError> {
-        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
         let bytes = std::fs::read(path).map_err(|source| ReconstructError::Io {
             path: path.to_owned(),
             action: "read",
             source,
         })?;
+        Self::parse(path, &bytes)
+    }
+
+    /// Reads and verifies the bytes of a file that [`TensorFile::write`] wrote; `path` is only named in errors.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, ReconstructError> {
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
         let broken = |e: safetensors::SafeTensorError| {
             fail(format!(
                 "expected a safetensors file, found a broken one ({e}); use an older checkpoint or start anew"
             ))
         };
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(broken)?;
-        let parsed = SafeTensors::deserialize(&bytes).map_err(broken)?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
+        let parsed = SafeTensors::deserialize(bytes).map_err(broken)?;
         let mut metadata: BTreeMap<String, String> =
             header.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
         let expected = metadata.remove(DIGEST_KEY);
         let mut views: Vec<(String, TensorView)> = parsed.tensors();
         views.sort_by(|a, b| a.0.cmp(&b.0));
-        let found = digest(views.iter().map(|(n, v)| (n, v.data())));
+        let found = tensor_digest(views.iter().map(|(n, v)| (n, v.data())));
         if expected.as_deref() != Some(found.as_str()) {
             return Err(fail("the checksum does not match its contents: the file was changed or damaged".into()));
         }
@@ -101,7 +102,11 @@ impl TensorFile {
             if view.dtype() != Dtype::F32 {
                 return Err(fail(format!("tensor {name}: expected f32, found {:?}", view.dtype())));
             }
-            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let values: Vec<f32> =
+                view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+                return Err(fail(format!("tensor {name}, value {at}: expected a finite number, found {}", values[at])));
+            }
             tensors.insert(name, (view.shape().to_vec(), values));
         }
         Ok(Self { tensors, metadata })

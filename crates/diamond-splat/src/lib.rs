@@ -21,6 +21,7 @@ mod rasterize;
 mod recycle;
 pub mod relocation;
 mod visibility;
+mod whole_file;
 mod wide;
 
 pub use config::{Cutoff, RasterConfig};
@@ -36,3 +37,4 @@ pub use ply::{
 pub use projection::{Footprint, Projection, project};
 pub use rasterize::{Raster, RasterGrad, RasterPullback, RasterStats, rasterize, rasterize_projected};
 pub use visibility::{GaussianBvh, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};
+pub use whole_file::{WriteFailure, remove_leftovers, write_whole};

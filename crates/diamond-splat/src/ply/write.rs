@@ -2,9 +2,8 @@
 use super::header::{PlyFormat, ScalarType, quoted};
 use super::{Place, PlyTable, in_file, malformed, refused};
 use crate::SplatError;
-use std::io::Write;
+use crate::whole_file::write_whole;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 /// The bytes of a PLY file with `table` as its vertex element.
 ///
@@ -115,40 +114,10 @@ pub fn write_ply(path: impl AsRef<Path>, table: &PlyTable) -> Result<(), SplatEr
     replace_file(path, &bytes)
 }
 
-/// Makes the temporary names of one process distinct.
-static TEMPORARY: AtomicU64 = AtomicU64::new(0);
-
-/// Writes `bytes` to `path` whole or not at all: a temporary file beside it, synchronised to the disk, renamed into
-/// place. What was there before stays until then.
+/// Writes `bytes` to `path` whole or not at all, see [`write_whole`].
 pub fn replace_file(path: &Path, bytes: &[u8]) -> Result<(), SplatError> {
-    let Some(name) = path.file_name() else {
-        return Err(refused(path, "cannot be written; name a file", std::io::ErrorKind::InvalidInput.into()));
-    };
-    let number = TEMPORARY.fetch_add(1, Ordering::Relaxed);
-    let mut temporary_name = std::ffi::OsString::from(".");
-    temporary_name.push(name);
-    temporary_name.push(format!(".{}.{number}.tmp", std::process::id()));
-    let temporary = path.with_file_name(temporary_name);
-    let written = (|| {
-        let mut file = std::fs::OpenOptions::new().write(true).create_new(true).open(&temporary)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        drop(file);
-        std::fs::rename(&temporary, path)
-    })();
-    if let Err(reason) = written {
-        // Leaves no debris; that the removal may fail as well changes nothing.
-        let _ = std::fs::remove_file(&temporary);
-        return Err(refused(
-            path,
-            "cannot be written; check the directory, its permissions and the space left",
-            reason,
-        ));
-    }
-    // The rename itself survives a crash only once the directory is on disk; not every system can do that.
-    if let Some(parent) = path.parent() {
-        let parent = if parent.as_os_str().is_empty() { Path::new(".") } else { parent };
-        let _ = std::fs::File::open(parent).and_then(|directory| directory.sync_all());
-    }
-    Ok(())
+    write_whole(path, bytes).map_err(|failure| {
+        let doing = format!("could not {}; check the folder, its permissions and the space left", failure.action);
+        refused(path, &doing, failure.source)
+    })
 }
