@@ -4,6 +4,7 @@ use crate::develop::Undistortion;
 use crate::exclusions::{Exclusions, strip_extension};
 use crate::format::{CaptureFormat, Found, Source};
 use crate::frames::{Frame, Frames};
+use crate::hash::Identity;
 use crate::lights::{Lights, parse_lights};
 use crate::views::Context;
 use crate::{DatasetError, Place, folder};
@@ -195,7 +196,8 @@ pub(crate) struct Shared {
     /// Images that are asked whether RGB is premultiplied, spread evenly over the capture as opened.
     pub(crate) witnesses: Vec<Shot>,
     pub(crate) premultiplied: OnceLock<bool>,
-    pub(crate) hash: OnceLock<String>,
+    /// What the files had in them when the capture was hashed.
+    pub(crate) identity: OnceLock<Identity>,
 }
 
 impl Capture {
@@ -269,7 +271,7 @@ impl Capture {
                 images,
                 witnesses: spread(&train, 8),
                 premultiplied: OnceLock::new(),
-                hash: OnceLock::new(),
+                identity: OnceLock::new(),
             }),
             root: found.root,
             train,

@@ -114,15 +114,22 @@ pub(crate) fn read_size(path: &Path, named_by: &Place) -> Result<(u32, u32), Dat
 /// The largest image file that is read, bytes.
 const MAX_FILE_BYTES: u64 = 4 << 30;
 
-/// Reads and decodes an image file.
-pub(crate) fn read_image(path: &Path, named_by: &Place, options: &DecodeOptions) -> Result<StoredImage, DatasetError> {
+/// The bytes of an image file; `named_by` is who names it.
+pub(crate) fn read_image_bytes(path: &Path, named_by: &Place, max_pixels: u64) -> Result<Vec<u8>, DatasetError> {
     use std::io::Read;
-    let io = |source| DatasetError::Io { place: named_by.clone().into(), action: "open the image", source };
+    let io = |source| {
+        let field = match &named_by.field {
+            Some(field) => format!("{field} = \"{}\"", path.display()),
+            None => format!("\"{}\"", path.display()),
+        };
+        let place = Place { file: named_by.file.clone(), frame: named_by.frame, field: Some(field) };
+        DatasetError::Io { place: place.into(), action: "open the image", source }
+    };
     let mut bytes = Vec::new();
     // Not even uncompressed float RGBA with as much again beside it is longer than this.
-    let limit = options.max_pixels.saturating_mul(32).saturating_add(64 << 20).min(MAX_FILE_BYTES);
+    let limit = max_pixels.saturating_mul(32).saturating_add(64 << 20).min(MAX_FILE_BYTES);
     std::fs::File::open(path).map_err(io)?.take(limit).read_to_end(&mut bytes).map_err(io)?;
-    decode(&bytes, options).map_err(|e| e.at(path, named_by, options.max_pixels))
+    Ok(bytes)
 }
 
 fn limits(bytes: u64) -> Limits {

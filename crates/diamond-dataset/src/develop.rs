@@ -4,7 +4,7 @@
 //! field of view is that of a pinhole with these numbers. Barrel distortion had room for more than that; what it showed
 //! beyond is cut off. Pincushion distortion had room for less; the rim is empty and not covered by the mask.
 use crate::background::subtract;
-use crate::decode::{DecodeOptions, read_image};
+use crate::decode::{DecodeOptions, decode, read_image_bytes};
 use crate::stored::{Samples, StoredImage};
 use crate::{Capture, DatasetError, MaskSource, Observation, Place, Shot};
 use diamond_camera::{Distortion, Intrinsics};
@@ -49,9 +49,22 @@ impl Capture {
         DecodeOptions { max_pixels: self.options.max_pixels, exr_transfer: self.options.exr_transfer }
     }
 
+    /// Reads and decodes an image file, which must not have changed since the capture was hashed.
+    fn read_unchanged(&self, path: &Path, named_by: &Place) -> Result<StoredImage, DatasetError> {
+        let options = self.decode_options();
+        let bytes = read_image_bytes(path, named_by, options.max_pixels)?;
+        self.check_unchanged(path, &bytes).map_err(|reason| DatasetError::Image {
+            path: path.to_path_buf(),
+            named_by: named_by.clone().into(),
+            reason,
+            advice: "put it back as it was, or start anew with the capture as it is",
+        })?;
+        decode(&bytes, &options).map_err(|e| e.at(path, named_by, options.max_pixels))
+    }
+
     /// The image of a shot as in its file, of the size that its frame says.
     pub(crate) fn read_shot(&self, shot: &Shot) -> Result<StoredImage, DatasetError> {
-        let image = read_image(&shot.path, &shot.named_by, &self.decode_options())?;
+        let image = self.read_unchanged(&shot.path, &shot.named_by)?;
         if (image.width, image.height) != (shot.width, shot.height) {
             return Err(DatasetError::Image {
                 path: shot.path.clone(),
@@ -103,7 +116,7 @@ impl Capture {
 
     /// A mask or background: of the size of the image that it belongs to.
     fn read_beside(&self, path: &Path, shot: &Shot, what: &str) -> Result<StoredImage, DatasetError> {
-        let image = read_image(path, &Place::file(path), &self.decode_options())?;
+        let image = self.read_unchanged(path, &Place::file(path))?;
         if (image.width, image.height) != (shot.width, shot.height) {
             return Err(DatasetError::Image {
                 path: path.to_path_buf(),

@@ -56,6 +56,7 @@ pub use error::{DatasetError, Place};
 pub use format::CaptureFormat;
 pub use frames::{Entry, Frame, Frames, parse_transforms};
 pub use geometry::Geometry;
+pub use hash::FileDigest;
 pub use lens::Lens;
 pub use lights::{LightEntry, LightFrame, Lights, parse_lights};
 pub use observation::{Observation, to_display};

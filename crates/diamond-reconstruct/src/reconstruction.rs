@@ -11,6 +11,7 @@ use crate::{
 use diamond_camera::Camera;
 use diamond_dataset::{Capture, Observation};
 use diamond_light::OlatLight;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -35,7 +36,11 @@ const STATE_FILE: &str = "state.safetensors";
 
 impl Reconstruction {
     /// Surveys the capture (its selected training part) and makes the model before the first step.
+    ///
+    /// The capture is hashed, if it has not been: from here on a file of it that changes is an error of the step that
+    /// meets it, and of [`Reconstruction::resume`].
     pub fn new(capture: Capture, config: &Config) -> Result<Self, ReconstructError> {
+        capture.hash()?;
         let (scene, points) = scene::survey(&capture, config)?;
         Self::from_points(capture, config, scene, &points, None)
     }
@@ -103,6 +108,12 @@ impl Reconstruction {
                 "it was made with other images; resume with the same capture, --views and --lights".into(),
             ));
         }
+        let then: String = file.metadata_value(&path, "capture_files")?;
+        if let Some(change) = change_of(&capture, &then)? {
+            return Err(fail(format!(
+                "the capture has changed since: {change}; put it back as it was, or start anew with the capture as it is"
+            )));
+        }
         let scene: Scene = toml::from_str(&file.metadata_value::<String>(&path, "scene")?)
             .map_err(|e| fail(format!("metadata `scene`: {e}")))?;
         let step: u64 = file.metadata_value(&path, "step")?;
@@ -133,6 +144,7 @@ impl Reconstruction {
         file.metadata.insert("step".into(), self.step.to_string());
         file.metadata.insert("config".into(), self.config.to_toml()?);
         file.metadata.insert("selection".into(), selection_of(&self.capture));
+        file.metadata.insert("capture_files".into(), files_of(&self.capture)?);
         file.metadata.insert("initial_origin".into(), self.initial_origin.clone());
         let path = folder.join(STATE_FILE);
         file.write(&path)?;
@@ -239,4 +251,36 @@ impl Reconstruction {
 fn selection_of(capture: &Capture) -> String {
     let names: Vec<&str> = capture.train.iter().flat_map(|v| &v.shots).map(|s| s.name.as_str()).collect();
     names.join(" ")
+}
+
+/// The files of the capture, as text: a line each, of a hash and the name.
+fn files_of(capture: &Capture) -> Result<String, ReconstructError> {
+    let lines: Vec<String> = capture.files()?.iter().map(|f| format!("{} {}", f.short(), f.name)).collect();
+    Ok(lines.join("\n"))
+}
+
+/// The first file that is not what [`files_of`] said then, and what became of it.
+fn change_of(capture: &Capture, then: &str) -> Result<Option<String>, ReconstructError> {
+    let now = files_of(capture)?;
+    if now == then {
+        return Ok(None);
+    }
+    let split = |text: &str| -> BTreeMap<String, String> {
+        text.lines().filter_map(|l| l.split_once(' ')).map(|(hash, name)| (name.to_owned(), hash.to_owned())).collect()
+    };
+    let (then, now) = (split(then), split(&now));
+    let named_by = |name: &str| {
+        let mut shots = capture.train.iter().chain(&capture.test).flat_map(|v| &v.shots);
+        let shot = shots.find(|s| s.path == capture.root.join(name));
+        shot.map_or(String::new(), |s| format!(" ({})", s.named_by))
+    };
+    for (name, hash) in &then {
+        match now.get(name) {
+            None => return Ok(Some(format!("{name} is no longer part of it"))),
+            Some(other) if other != hash => return Ok(Some(format!("{name}{} has other content", named_by(name)))),
+            Some(_) => {}
+        }
+    }
+    let added = now.keys().find(|name| !then.contains_key(*name));
+    Ok(Some(added.map_or("the order of its files".into(), |name| format!("{name}{} was added", named_by(name)))))
 }
