@@ -29,7 +29,12 @@ pub enum CameraChoice {
 /// OpenGL axes) and `width`, `height` and either `fl_x` (`fl_y`, `cx`, `cy` optional) or `camera_angle_x`; what all
 /// share may stand beside `frames`.
 pub fn read_cameras(path: &Path) -> Result<Vec<Camera>, SssError> {
-    let value: Value = crate::output_file::read_json(path, "a camera as JSON")?;
+    parse_cameras(path, &std::fs::read(path).map_err(SssError::io(path, "read"))?)
+}
+
+/// Reads the bytes of a file of cameras, see [`read_cameras`]; `path` is only named in errors.
+pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, SssError> {
+    let value: Value = crate::output_file::parse_json(path, bytes, "a camera as JSON")?;
     let (frames, shared) = match &value {
         Value::Array(frames) => (frames.clone(), json!({})),
         Value::Object(map) => match map.get("frames") {

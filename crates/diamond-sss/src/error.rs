@@ -1,7 +1,7 @@
 //! What can go wrong, and which exit code tells it to a script.
 use diamond_dataset::DatasetError;
 use diamond_metrics::MetricError;
-use diamond_reconstruct::ReconstructError;
+use diamond_reconstruct::{ReconstructError, io_advice};
 use diamond_splat_files::SplatFileError;
 use std::path::{Path, PathBuf};
 
@@ -80,10 +80,11 @@ impl SssError {
 
 /// A file that cannot be read is bad input; one that cannot be written is a failed run.
 fn reading(action: &str, source: &std::io::Error) -> u8 {
-    if source.kind() == std::io::ErrorKind::NotFound || action.starts_with("read") || action.starts_with("open") {
-        3
-    } else {
-        1
+    let writing = ["write", "create", "sync", "rename", "remove"].iter().any(|verb| action.starts_with(verb));
+    match source.kind() {
+        std::io::ErrorKind::NotFound if !writing => 3,
+        _ if action.starts_with("read") || action.starts_with("open") => 3,
+        _ => 1,
     }
 }
 
@@ -97,14 +98,7 @@ impl std::fmt::Display for SssError {
             Self::Metric(e) => write!(f, "evaluation: {e}"),
             Self::Input { path, detail } => write!(f, "{}: {detail}", path.display()),
             Self::Io { path, action, source } => {
-                write!(f, "{}: could not {action}: {source}", path.display())?;
-                match source.kind() {
-                    std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => write!(
-                        f,
-                        "; the last checkpoint is intact: free some space and run the same command with --resume"
-                    ),
-                    _ => Ok(()),
-                }
+                write!(f, "{}: could not {action}: {source}{}", path.display(), io_advice(source))
             }
             Self::Exists(path) => write!(
                 f,

@@ -33,7 +33,7 @@ mod run_record;
 mod splat_picture;
 mod training_log;
 
-pub use camera_path::{CameraChoice, cameras_of, read_cameras};
+pub use camera_path::{CameraChoice, cameras_of, parse_cameras, read_cameras};
 pub use capture_check::open_capture;
 pub use error::SssError;
 pub use evaluation::{ImageScore, PSNR_CAP, Scored, evaluate_model};

@@ -26,7 +26,11 @@ pub(crate) fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(
 
 /// Reads a value from JSON; `what` says in errors what the file should hold.
 pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path, what: &str) -> Result<T, SssError> {
-    let text = std::fs::read_to_string(path).map_err(SssError::io(path, "read"))?;
-    serde_json::from_str(&text)
+    parse_json(path, &std::fs::read(path).map_err(SssError::io(path, "read"))?, what)
+}
+
+/// Reads a value from the bytes of a JSON file; `path` is only named in errors.
+pub(crate) fn parse_json<T: serde::de::DeserializeOwned>(path: &Path, bytes: &[u8], what: &str) -> Result<T, SssError> {
+    serde_json::from_slice(bytes)
         .map_err(|e| SssError::Input { path: path.to_owned(), detail: format!("expected {what}: {e}") })
 }

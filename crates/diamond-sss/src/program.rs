@@ -2,6 +2,7 @@
 mod cli;
 mod progress;
 mod reconstruct;
+mod signals;
 
 use clap::Parser;
 use cli::{Cli, Command, RenderArguments};
@@ -15,6 +16,7 @@ use std::process::ExitCode;
 /// Runs the program.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
+    signals::file_limit_is_an_error();
     let filter = tracing_subscriber::EnvFilter::try_from_env("DIAMOND_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
     tracing_subscriber::fmt()
@@ -22,14 +24,21 @@ pub fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .with_target(false)
         .without_time()
+        .log_internal_errors(false)
         .init();
     match run(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("diamond: {error}");
+            complain(&format!("diamond: {error}"));
             ExitCode::from(error.exit_code())
         }
     }
+}
+
+/// A line to the user beside the results. `eprintln!` would end the program where standard error is gone (a closed
+/// terminal, a full disk behind a redirection), and with it hours of work.
+fn complain(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// Prints; that the reader has gone (`diamond … | head`) is no error.

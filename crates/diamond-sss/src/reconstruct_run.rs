@@ -6,7 +6,8 @@ use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
 use crate::{Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
 use diamond_dataset::{Capture, Selection};
-use diamond_reconstruct::{Config, InitialSource, InstructionChoice, Reconstruction, StepReport};
+use diamond_reconstruct::{Config, InitialSource, InstructionChoice, ReconstructError, Reconstruction, StepReport};
+use diamond_splat::remove_leftovers;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -168,6 +169,25 @@ fn clear(folder: &Path) -> Result<(), SssError> {
     Ok(())
 }
 
+/// Whether results can be put into `folder`, found out before hours are spent: what is there must be a folder that can
+/// be written to, or there must be a place for one.
+fn check_output_folder(folder: &Path) -> Result<(), SssError> {
+    let nearest = folder.ancestors().find(|p| p.as_os_str().is_empty() || p.exists());
+    if let Some(file) = nearest.filter(|p| !p.as_os_str().is_empty() && !p.is_dir()) {
+        let file = file.display();
+        return Err(SssError::Usage(format!(
+            "{}: cannot hold the results since {file} is a file and no folder; name another folder with -o",
+            folder.display()
+        )));
+    }
+    if folder.is_dir() {
+        let probe = folder.join(format!(".probe.{}.0.tmp", std::process::id()));
+        std::fs::File::create(&probe).map_err(SssError::io(folder, "write into the folder"))?;
+        std::fs::remove_file(&probe).map_err(SssError::io(&probe, "remove"))?;
+    }
+    Ok(())
+}
+
 /// Reconstructs. `events` is told what happens; when `interrupted` becomes true the step is finished, a checkpoint
 /// written, and [`SssError::Interrupted`] returned. The same bits come out whatever the number of threads.
 pub fn reconstruct(
@@ -199,15 +219,22 @@ fn run(
     if holds_results(folder) && !options.resume && !options.force {
         return Err(SssError::Exists(folder.to_owned()));
     }
+    check_output_folder(folder)?;
     let whole = open_capture(&options.capture, &config)?;
     whole.notes.iter().for_each(|note| events(Event::Note(note.clone())));
+    // Before anything is decoded: from here on a file whose content changes is refused when it is read.
+    let capture_hash = whole.hash()?;
     check_images(&whole)?;
     let mut capture = whole.select(&options.views, &options.lights)?;
     if let Some(path) = &options.initial {
         capture.points = Some(path.clone());
     }
-    let capture_hash = whole.hash()?;
     std::fs::create_dir_all(folder).map_err(SssError::io(folder, "create the folder"))?;
+    for folder in [folder.to_owned(), checkpoint.clone(), folder.join("images")] {
+        for path in remove_leftovers(&folder) {
+            events(Event::Note(format!("{}: left by a process that was killed, removed", path.display())));
+        }
+    }
     if options.force {
         clear(folder)?;
     }
@@ -247,7 +274,23 @@ fn run(
         write_json(&checkpoint.join(COSTS_FILE), &spent(training))
     };
     while !training.finished() {
-        let report = training.step()?;
+        let report = match training.step() {
+            Ok(report) => report,
+            Err(e @ ReconstructError::Capture(_)) => {
+                // The state is that of the last whole step. What failed is reading, and that is what is to be reported.
+                log.flush();
+                if save(&mut training, &log).is_ok() {
+                    events(Event::Checkpoint { step: training.steps_done() });
+                    events(Event::Note(format!(
+                        "{} steps are kept in {}: put the file back as it was and run the same command with --resume",
+                        training.steps_done(),
+                        checkpoint.display()
+                    )));
+                }
+                return Err(e.into());
+            }
+            Err(e) => return Err(e.into()),
+        };
         log.push(&report);
         events(Event::Step { report: &report, psnr: log.running_psnr().unwrap_or(0.0) });
         let stop = interrupted.load(Ordering::SeqCst);
@@ -266,7 +309,10 @@ fn run(
     let model = training.model()?;
     let scores = evaluate_with(model, &capture, |done, all, _| {
         events(Event::Evaluated { done, all });
-        Ok(())
+        match interrupted.load(Ordering::SeqCst) {
+            true => Err(SssError::Interrupted { step: config.steps, folder: folder.to_owned() }),
+            false => Ok(()),
+        }
     })?;
     let seconds = earlier.seconds + begun.elapsed().as_secs_f64();
     let peak = peak_bytes().max(earlier.peak_bytes);

@@ -1,13 +1,16 @@
 //! What a run was asked for and what it learned from: `run.json`. Later commands need it to tell seen from unseen
 //! lights, and to render without the capture.
 use crate::SssError;
-use crate::output_file::{read_json, write_json};
+use crate::output_file::{parse_json, write_json};
 use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_dataset::Capture;
 use diamond_light::OlatLight;
 use glam::{Mat4, Vec3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+
+/// Pictures of more pixels are not rendered: 8192 × 8192.
+const MAX_PIXELS: u64 = 64 << 20;
 
 /// Name of the file in the run's folder.
 pub(crate) const RUN_FILE: &str = "run.json";
@@ -65,6 +68,12 @@ impl StoredCamera {
         };
         let camera = Camera { intrinsics, pose };
         camera.validate().map_err(|e| fail(e.to_string()))?;
+        if u64::from(self.width) * u64::from(self.height) > MAX_PIXELS {
+            return Err(fail(format!(
+                "width and height: expected at most {MAX_PIXELS} pixels, found {}×{}",
+                self.width, self.height
+            )));
+        }
         Ok(camera)
     }
 }
@@ -189,7 +198,13 @@ impl RunRecord {
         if !path.is_file() {
             return Ok(None);
         }
-        read_json(&path, "what `diamond reconstruct` wrote").map(Some)
+        let bytes = std::fs::read(&path).map_err(SssError::io(&path, "read"))?;
+        Self::parse(&path, &bytes).map(Some)
+    }
+
+    /// Reads the bytes of a `run.json`; `path` is only named in errors.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, SssError> {
+        parse_json(path, bytes, "what `diamond reconstruct` wrote")
     }
 }
 

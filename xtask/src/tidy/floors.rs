@@ -117,6 +117,7 @@ pub const PACKAGES: &[Package] = &[
             "exr",
             "base64",
             "ctrlc",
+            "signal-hook",
         ],
     ),
     Package { name: "xtask", floor: 6, outside: None, optional: &[], alone: None },

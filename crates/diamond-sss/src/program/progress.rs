@@ -53,7 +53,11 @@ impl Counter {
                 self.said = Instant::now();
                 let elapsed = self.begun.elapsed().as_secs_f64();
                 let left = elapsed / (done - first).max(1) as f64 * (all - done) as f64;
-                eprintln!("{} {done}/{all}  {elapsed:.0} s (left {left:.0} s)  {}", self.what, message());
+                super::complain(&format!(
+                    "{} {done}/{all}  {elapsed:.0} s (left {left:.0} s)  {}",
+                    self.what,
+                    message()
+                ));
             }
             None => {}
         }

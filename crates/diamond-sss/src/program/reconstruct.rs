@@ -15,11 +15,12 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         if flag.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
         }
-        eprintln!("diamond: finishing the step and writing a checkpoint; press Ctrl-C again to stop at once");
+        super::complain("diamond: finishing the step and writing a checkpoint; press Ctrl-C again to stop at once");
     });
     if let Err(e) = handler {
         tracing::warn!("Ctrl-C will not write a checkpoint: {e}");
     }
+    super::signals::terminate_interrupts(&interrupted);
     let options = ReconstructOptions {
         capture: a.capture,
         output: a.output,

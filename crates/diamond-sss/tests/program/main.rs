@@ -1,6 +1,12 @@
 //! The built program, from the outside: files, exit codes, messages, and a real `kill -9`.
 mod bad_input;
 mod captures;
+#[cfg(unix)]
+mod changed_capture;
+#[cfg(unix)]
+mod disk;
+mod killed;
+mod sessions;
 
 use captures::{scratch, small_config, tiny_capture};
 use std::path::Path;
@@ -111,38 +117,5 @@ fn from_capture_to_report_and_pictures() {
     assert_eq!(diamond(&["presets", "no-such"]).status.code(), Some(3));
     assert_eq!(diamond(&["reconstruct"]).status.code(), Some(2));
     assert_eq!(diamond(&["evaluate", text(&dir.join("nothing")), text(&capture)]).status.code(), Some(3));
-    std::fs::remove_dir_all(dir).unwrap();
-}
-
-#[test]
-fn killed_and_resumed_gives_the_same_bits() {
-    let dir = scratch("kill");
-    let (capture, config) = (dir.join("capture"), small_config(&dir));
-    tiny_capture(&capture, 3, 2);
-    let (whole, killed) = (dir.join("whole"), dir.join("killed"));
-    let arguments = |out: &Path| -> Vec<String> {
-        let words = ["reconstruct", text(&capture), "-o", text(out), "--preset", text(&config), "--steps", "60"];
-        words.iter().map(|s| (*s).to_owned()).collect()
-    };
-    let program = || Command::new(env!("CARGO_BIN_EXE_diamond"));
-    assert!(program().args(arguments(&whole)).output().unwrap().status.success());
-    let mut child = program().args(arguments(&killed)).stderr(std::process::Stdio::null()).spawn().unwrap();
-    let state = killed.join("checkpoint/state.safetensors");
-    for _ in 0..6000 {
-        if state.is_file() || child.try_wait().unwrap().is_some() {
-            break;
-        }
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
-    // On Unix this is SIGKILL: nothing in the program can answer it.
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(state.is_file());
-    let resumed = program().args(arguments(&killed)).arg("--resume").output().unwrap();
-    assert!(resumed.status.success(), "{}", stderr(&resumed));
-    for name in ["model.ply", "network.safetensors", "metrics.csv"] {
-        let (a, b) = (std::fs::read(whole.join(name)).unwrap(), std::fs::read(killed.join(name)).unwrap());
-        assert!(a == b, "{name} differs after kill and resume");
-    }
     std::fs::remove_dir_all(dir).unwrap();
 }
