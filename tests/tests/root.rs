@@ -5,6 +5,7 @@ mod captures;
 mod determinism;
 mod fixtures;
 mod formats;
+mod fuzz;
 mod oracles;
 mod resume;
 mod standalone;
