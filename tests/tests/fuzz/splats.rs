@@ -99,6 +99,7 @@ fn ply() -> Target {
         scales: vec![glam::Vec3::ONE, glam::Vec3::splat(0.1)],
         rotations: vec![glam::Quat::IDENTITY; 2],
         opacities: vec![0.5, 0.9],
+        ..Default::default()
     });
     let bytes = |format| ply_bytes(&splats.to_table(), format).unwrap();
     let seeds = vec![
