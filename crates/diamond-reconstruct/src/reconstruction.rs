@@ -215,29 +215,29 @@ impl Reconstruction {
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
         let plan = StepPlan::new(&self.config, self.step);
         let batch = self.config.accumulate as u64;
-        let mut loaded: Vec<(usize, usize, usize, Option<Region>, Arc<Observation>)> =
-            Vec::with_capacity(batch as usize);
+        let mut loaded: Vec<Loaded> = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let pair = self.order.at(self.step * batch + k);
             let (v, s) = self.pairs[pair];
             let observation = self.capture.observation(&self.capture.train[v].shots[s])?;
             let look = || Region::of_photograph(&observation.radiance, observation.mask.as_ref());
             let content = *self.contents[pair].get_or_insert_with(look);
-            loaded.push((v, s, pair, content, observation));
+            loaded.push(Loaded { view: v, shot: s, image: pair, content, observation });
         }
         let pairs: Vec<TrainingPair<'_>> = loaded
             .iter()
-            .map(|(v, s, pair, content, observation)| {
-                let view = &self.capture.train[*v];
+            .map(|loaded| {
+                let view = &self.capture.train[loaded.view];
+                let shot = &view.shots[loaded.shot];
                 TrainingPair {
                     camera: &view.camera,
-                    light: &view.shots[*s].light,
-                    radiance: &observation.radiance,
-                    mask: observation.mask.as_ref(),
-                    weight: view.shots[*s].weight,
-                    content: *content,
-                    view: *v,
-                    image: *pair,
+                    light: &shot.light,
+                    radiance: &loaded.observation.radiance,
+                    mask: loaded.observation.mask.as_ref(),
+                    weight: shot.weight,
+                    content: loaded.content,
+                    view: loaded.view,
+                    image: loaded.image,
                 }
             })
             .collect();
@@ -245,6 +245,18 @@ impl Reconstruction {
         self.step += 1;
         Ok(report)
     }
+}
+
+/// An image of a step's batch.
+struct Loaded {
+    view: usize,
+    /// Within the view.
+    shot: usize,
+    /// Among all images.
+    image: usize,
+    /// The part of it that is not empty.
+    content: Option<Region>,
+    observation: Arc<Observation>,
 }
 
 /// The images that a run learns from, as text.

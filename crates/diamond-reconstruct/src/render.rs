@@ -43,6 +43,9 @@ pub struct Renderer<'m> {
     tracer: OnceLock<Tracer>,
 }
 
+/// Shades a group of lights of a view from their channels.
+type ShadeGroup<'a> = dyn FnMut(&ViewHalf, &[OlatLight], &Image) -> Result<(), ReconstructError> + 'a;
+
 /// How much work a view was.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RenderWork {
@@ -221,7 +224,7 @@ impl<'m> Renderer<'m> {
         camera: &Camera,
         lights: &[OlatLight],
         layout: &ChannelLayout,
-        shade: &mut dyn FnMut(&ViewHalf, &[OlatLight], &Image) -> Result<(), ReconstructError>,
+        shade: &mut ShadeGroup<'_>,
     ) -> Result<(), ReconstructError> {
         if lights.is_empty() {
             return Ok(());
