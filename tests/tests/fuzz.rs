@@ -195,7 +195,9 @@ fn planted_faults_are_noticed() {
     });
     said(&greedy, "bytes of memory");
     let slow = planted("planted_loop", |_, n| {
-        while n > 1000 && !NOTICED.load(Ordering::SeqCst) {}
+        while n > 1000 && !NOTICED.load(Ordering::SeqCst) {
+            std::hint::spin_loop();
+        }
         Ok(Answer::Parsed)
     });
     NOTICED.store(true, Ordering::SeqCst);

@@ -21,18 +21,23 @@ pub enum Selection {
 /// Indices above this are refused: no capture has so many views or lights.
 const MAX_INDEX: usize = 1_000_000;
 
+/// Characters of a selection that a message repeats.
+const MAX_QUOTED: usize = 80;
+
 /// As written on a command line: `all`; a count, `3`; indices, `0,5,7`, ranges included, `0-7` or `0-3,9`; one index
 /// alone with a comma, `2,`.
 impl FromStr for Selection {
     type Err = DatasetError;
 
     fn from_str(text: &str) -> Result<Self, DatasetError> {
+        let quoted: String = text.chars().take(MAX_QUOTED).collect();
         let bad = |reason: String| DatasetError::Selection {
             what: "selection",
-            reason: format!("\"{text}\": {reason}; write a count (3), indices (0,5,7 or 2,), ranges (0-7), or all"),
+            reason: format!("\"{quoted}\": {reason}; write a count (3), indices (0,5,7 or 2,), ranges (0-7), or all"),
         };
         let number = |part: &str| -> Result<usize, DatasetError> {
-            let value = part.trim().parse::<usize>().map_err(|_| bad(format!("\"{part}\" is no whole number")))?;
+            let value =
+                part.trim().parse::<usize>().map_err(|_| bad(format!("\"{:.40}\" is no whole number", part.trim())))?;
             if value > MAX_INDEX { Err(bad(format!("{value} is larger than {MAX_INDEX}"))) } else { Ok(value) }
         };
         let trimmed = text.trim();
@@ -54,6 +59,11 @@ impl FromStr for Selection {
                         return Err(bad(format!("the range {a}-{b} runs backwards")));
                     }
                     list.extend(a..=b);
+                    // Ranges that overlap many times take no more memory than one.
+                    if list.len() > 2 * MAX_INDEX {
+                        list.sort_unstable();
+                        list.dedup();
+                    }
                 }
                 None => list.push(number(part)?),
             }

@@ -2,6 +2,7 @@
 //!
 //! A file may name a `base` preset and say only what differs. Unknown keys are errors, so that a typing mistake never
 //! silently leaves a default in place. Step numbers are fractions of the run's length unless the name says `steps`.
+use crate::error::brief;
 use crate::{InstructionChoice, ReconstructError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -575,7 +576,7 @@ fn merge(base: &mut toml::Table, over: toml::Table) {
 
 fn table_of(text: &str, origin: &str) -> Result<toml::Table, ReconstructError> {
     let fail = |detail: String| ReconstructError::Config { origin: origin.to_owned(), detail };
-    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| fail(e.to_string()))?;
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| fail(brief(e)))?;
     let Some(base) = table.remove("base") else { return Ok(table) };
     let name = base.as_str().ok_or_else(|| fail(format!("`base` must be the name of a preset, found {base}")))?;
     let text = preset_text(name)
@@ -619,7 +620,7 @@ impl Config {
         }
         let config: Config = toml::Value::Table(table)
             .try_into()
-            .map_err(|e: toml::de::Error| ReconstructError::Config { origin: origin.into(), detail: e.to_string() })?;
+            .map_err(|e: toml::de::Error| ReconstructError::Config { origin: origin.into(), detail: brief(e) })?;
         config.validate(origin)?;
         Ok(config)
     }

@@ -72,6 +72,18 @@ impl std::fmt::Display for ReconstructError {
     }
 }
 
+/// Columns of a quoted line that a message shows.
+const MAX_COLUMNS: usize = 200;
+
+/// The message of a parser of text, with long lines that it quotes cut short.
+pub(crate) fn brief(error: impl std::fmt::Display) -> String {
+    let cut = |line: &str| match line.char_indices().nth(MAX_COLUMNS) {
+        Some((end, _)) => format!("{}…", &line[..end]),
+        None => line.to_owned(),
+    };
+    error.to_string().trim_end().lines().map(cut).collect::<Vec<_>>().join("\n")
+}
+
 /// What to do about an answer of the operating system, to be appended to a message; empty where there is nothing to say.
 pub fn io_advice(source: &std::io::Error) -> &'static str {
     use std::io::ErrorKind;
@@ -111,4 +123,23 @@ impl From<diamond_dataset::DatasetError> for ReconstructError {
 /// Turns the error of a lower crate into [`ReconstructError::Internal`] with the stage's name.
 pub(crate) fn stage<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> ReconstructError {
     move |e| ReconstructError::Internal { stage, detail: e.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quoted_lines_are_cut_and_advice_is_given() {
+        let long = format!("at 1\n{}\nend\n", "ä".repeat(5000));
+        assert_eq!(brief(long), format!("at 1\n{}…\nend", "ä".repeat(200)));
+        for (kind, word) in [
+            (std::io::ErrorKind::StorageFull, "--resume"),
+            (std::io::ErrorKind::FileTooLarge, "ulimit"),
+            (std::io::ErrorKind::PermissionDenied, "another place"),
+            (std::io::ErrorKind::Other, ""),
+        ] {
+            assert!(io_advice(&kind.into()).contains(word));
+        }
+    }
 }

@@ -157,7 +157,7 @@ impl Model {
         let origin = folder.join("config.toml").display().to_string();
         let config = Config::parse(&read("config.toml")?, &origin)?;
         let scene: Scene = toml::from_str(&read("scene.toml")?)
-            .map_err(|e| ReconstructError::Config { origin: "scene.toml".into(), detail: e.to_string() })?;
+            .map_err(|e| ReconstructError::Config { origin: "scene.toml".into(), detail: error::brief(e) })?;
         let path = folder.join("model.ply");
         let table =
             read_ply(&path).map_err(|e| ReconstructError::Checkpoint { path: path.clone(), detail: e.to_string() })?;

@@ -115,7 +115,7 @@ impl Reconstruction {
             )));
         }
         let scene: Scene = toml::from_str(&file.metadata_value::<String>(&path, "scene")?)
-            .map_err(|e| fail(format!("metadata `scene`: {e}")))?;
+            .map_err(|e| fail(format!("metadata `scene`: {}", crate::error::brief(e))))?;
         let step: u64 = file.metadata_value(&path, "step")?;
         let origin: String = file.metadata_value(&path, "initial_origin")?;
         let points = InitialPoints { origin, ..Default::default() };

@@ -34,7 +34,7 @@ pub fn parse_vec3(text: &str) -> Result<Vec3, SssError> {
     let numbers: Vec<f32> = text.split(',').filter_map(|p| p.trim().parse().ok()).collect();
     match numbers.as_slice() {
         [x, y, z] if text.split(',').count() == 3 && numbers.iter().all(|v| v.is_finite()) => Ok(Vec3::new(*x, *y, *z)),
-        _ => Err(SssError::Usage(format!("\"{text}\": expected three finite numbers x,y,z"))),
+        _ => Err(SssError::Usage(format!("\"{text:.80}\": expected three finite numbers x,y,z"))),
     }
 }
 
@@ -42,7 +42,7 @@ pub fn parse_vec3(text: &str) -> Result<Vec3, SssError> {
 pub fn parse_mix(text: &str) -> Result<Vec<(Vec3, Vec3)>, SssError> {
     let parts: Vec<&str> = text.split(';').map(str::trim).filter(|p| !p.is_empty()).collect();
     if parts.is_empty() {
-        return Err(SssError::Usage(format!("\"{text}\": expected lights as x,y,z:r,g,b;x,y,z:r,g,b")));
+        return Err(SssError::Usage(format!("\"{text:.80}\": expected lights as x,y,z:r,g,b;x,y,z:r,g,b")));
     }
     parts
         .into_iter()
@@ -50,7 +50,7 @@ pub fn parse_mix(text: &str) -> Result<Vec<(Vec3, Vec3)>, SssError> {
             let (position, colour) = part.split_once(':').unwrap_or((part, "1,1,1"));
             let colour = parse_vec3(colour)?;
             if colour.min_element() < 0.0 {
-                return Err(SssError::Usage(format!("\"{part}\": intensities must not be negative")));
+                return Err(SssError::Usage(format!("\"{part:.80}\": intensities must not be negative")));
             }
             Ok((parse_vec3(position)?, colour))
         })

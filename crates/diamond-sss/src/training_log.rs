@@ -111,7 +111,7 @@ impl TrainingLog {
         log.terms = header[4..].iter().map(|s| (*s).to_owned()).collect();
         for line in lines {
             let cells: Vec<f64> = line.split(',').filter_map(|c| c.parse().ok()).collect();
-            if cells.len() != header.len() || cells[0] as u64 > step {
+            if cells.len() != header.len() || cells.iter().any(|c| !c.is_finite()) || cells[0] as u64 > step {
                 break;
             }
             log.rows.push(LogRow {
@@ -155,6 +155,8 @@ mod tests {
         let again = TrainingLog::read_until(&path, 6000, 6);
         assert_eq!(again.rows, log.rows[..2]);
         assert_eq!(again.terms, ["l1"]);
+        std::fs::write(&path, "step,objective,psnr,gaussians\n1,0.5,20,9\n2,NaN,20,9\n3,0.5,20,9\n").unwrap();
+        assert_eq!(TrainingLog::read_until(&path, 6000, 6).rows.len(), 1, "a row that is not finite ends it");
         std::fs::write(&path, "nonsense").unwrap();
         assert!(TrainingLog::read_until(&path, 6000, 6).rows.is_empty());
         std::fs::remove_file(path).unwrap();

@@ -59,17 +59,17 @@ const WORDS: &[&str] = &[
     "\u{202e}",
 ];
 
-/// Changes `input` one to eight times. `other` is another good file of the kind.
+/// Changes `input` once or a few times. `other` is another good file of the kind.
 pub fn mutate(random: &mut Random, input: &mut Vec<u8>, other: &[u8], text: bool) {
     let longest = input.len() + GROWTH;
     loop {
-        if text && !random.one_in(4) {
+        if text && !random.one_in(8) {
             change_text(random, input, other)
         } else {
             change_bytes(random, input, other)
         }
         input.truncate(longest);
-        if random.one_in(3) {
+        if random.one_in(2) {
             return;
         }
     }
