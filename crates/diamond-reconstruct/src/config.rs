@@ -574,6 +574,15 @@ fn merge(base: &mut toml::Table, over: toml::Table) {
     }
 }
 
+/// The key of a number that is infinite or none.
+fn first_non_finite(table: &toml::Table) -> Option<String> {
+    table.iter().find_map(|(key, value)| match value {
+        toml::Value::Float(v) if !v.is_finite() => Some(key.clone()),
+        toml::Value::Table(inner) => first_non_finite(inner).map(|rest| format!("{key}.{rest}")),
+        _ => None,
+    })
+}
+
 fn table_of(text: &str, origin: &str) -> Result<toml::Table, ReconstructError> {
     let fail = |detail: String| ReconstructError::Config { origin: origin.to_owned(), detail };
     let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| fail(brief(e)))?;
@@ -617,6 +626,10 @@ impl Config {
             let mut merged = table_of(include_str!("../presets/resolved.toml"), "resolved")?;
             merge(&mut merged, table);
             table = merged;
+        }
+        if let Some(key) = first_non_finite(&table) {
+            let detail = format!("`{key}` must be a finite number");
+            return Err(ReconstructError::Config { origin: origin.into(), detail });
         }
         let config: Config = toml::Value::Table(table)
             .try_into()
