@@ -55,7 +55,7 @@ fn train(model: Model, capture: &Capture, gains: &[f32]) -> Model {
 }
 
 /// A model that was trained on the photographs as they are, and is now held fixed, tells gains from content. (After 300
-/// steps instead of 900 gains are off by 14 % even where all are 1: they take up what the model cannot explain yet.)
+/// steps instead of 1500 gains are off by 14 % even where all are 1: they take up what the model cannot explain yet.)
 #[test]
 fn known_gains_are_found_again_where_the_model_is_known() {
     let capture = capture(4, 3);
@@ -65,7 +65,7 @@ fn known_gains_are_found_again_where_the_model_is_known() {
     let mean = logs.iter().sum::<f32>() / images as f32;
     logs.iter_mut().for_each(|g| *g -= mean);
     let gains: Vec<f32> = logs.iter().map(|g| g.exp()).collect();
-    let start = config(ExposureMode::PerImage, 900);
+    let start = config(ExposureMode::PerImage, 1500);
     let mut model = Reconstruction::new(capture.clone(), &start).expect("starts").model().expect("a model").clone();
     model.config.exposure.rate = 0.0;
     let mut model = train(model, &capture, &vec![1.0; images]);
@@ -98,7 +98,7 @@ fn known_gains_are_found_again_where_the_model_is_known() {
     let worst = errors.iter().copied().fold(0.0, f32::max);
     let typical = errors.iter().sum::<f32>() / images as f32;
     println!("gains: worst {worst:.4}, mean {typical:.4}");
-    assert!(typical < 0.02 && worst < 0.06, "gains are off by {typical} in the mean, {worst} at worst");
+    assert!(typical < 0.02 && worst < 0.05, "gains are off by {typical} in the mean, {worst} at worst");
 }
 
 #[test]
