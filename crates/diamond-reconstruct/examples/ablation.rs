@@ -1,8 +1,9 @@
 //! Trains one configuration on a capture and prints PSNR on its test pairs, seen and unseen lights apart: the smallest
 //! loop for comparing settings. `cargo run --release -p diamond-reconstruct --example ablation -- CAPTURE PRESET
-//! [key=value …]`, where a key is a dotted path of the configuration such as `loss.ssim` and `views`/`lights` select.
+//! [key=value …]`, where a key is a dotted path of the configuration such as `loss.ssim`, `views`/`lights` select, and
+//! `needs=everything` leaves nothing out.
 use diamond_dataset::{Capture, OpenOptions, Selection};
-use diamond_reconstruct::{Config, Reconstruction};
+use diamond_reconstruct::{Config, Needs, Reconstruction};
 use std::time::Instant;
 
 type Failure = Box<dyn std::error::Error>;
@@ -17,18 +18,22 @@ fn main() -> Result<(), Failure> {
         return Err("usage: ablation CAPTURE PRESET [key=value …]".into());
     };
     let mut text = format!("base = \"{preset}\"\n");
-    let (mut views, mut lights) = (Selection::All, Selection::All);
+    let (mut views, mut lights, mut everything) = (Selection::All, Selection::All, false);
     for pair in rest {
         let (key, value) = pair.split_once('=').ok_or("expected key=value")?;
         match key {
             "views" => views = value.parse()?,
             "lights" => lights = value.parse()?,
+            "needs" if value == "everything" => everything = true,
             _ => text.push_str(&format!("{key} = {value}\n")),
         }
     }
     let config = Config::parse(&text, "command line")?;
     let capture = Capture::open(capture.as_ref(), &OpenOptions::default())?.select(&views, &lights)?;
-    let mut run = Reconstruction::new(capture, &config)?;
+    let mut run = match everything {
+        true => Reconstruction::with_needs(capture, &config, Needs::everything())?,
+        false => Reconstruction::new(capture, &config)?,
+    };
     let start = Instant::now();
     let mut recent = 0.0;
     while !run.finished() {
@@ -79,6 +84,9 @@ fn main() -> Result<(), Failure> {
     }
     for (name, seconds) in run.profile() {
         eprintln!("{name:20} {:8.3} ms/step", 1e3 * seconds / config.steps as f64);
+    }
+    for (name, count) in run.counters() {
+        eprintln!("{name:32} {:12.2} /step", count as f64 / config.steps as f64);
     }
     println!(
         "{preset} {} | seen {:.2} dB (masked {:.2}) | unseen {:.2} dB (masked {:.2}) | {:.2} steps/s | {} Gaussians",
