@@ -34,7 +34,8 @@ enum Tool {
     Oracle {
         /// Which family of references.
         kind: OracleKind,
-        /// A file or folder of the form of assets/fixtures/{ggx,splat,metrics}.
+        /// A file or folder of the form of assets/fixtures/{ggx,splat,metrics} or of those in
+        /// assets/fixtures/transport (analytic, mitsuba).
         path: PathBuf,
     },
     /// Check the house rules: floors, outside crates, file heads, equation tags, and more.

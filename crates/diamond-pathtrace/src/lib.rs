@@ -26,6 +26,7 @@
 //! ```
 mod boundary;
 mod clearance;
+pub mod closed_form;
 mod coat;
 mod environment;
 mod error;
@@ -37,7 +38,11 @@ mod medium;
 mod mesh;
 mod mesh_geometry;
 mod path;
+mod ply;
 mod reference;
+mod repair;
+mod repair_holes;
+mod repair_nesting;
 mod rng;
 pub mod sampling;
 mod scene;
@@ -53,7 +58,9 @@ pub use medium::{Flight, FreeFlight, MAX_MEAN_COSINE, Medium, henyey_greenstein,
 pub use mesh::{MAX_COORDINATE, Mesh};
 pub use mesh_geometry::MeshGeometry;
 pub use path::{PathEnd, PathOptions, Tracer};
+pub use ply::{parse_ply, read_ply};
 pub use reference::{LightImage, ReferenceImage, ReferenceOptions, render_reference};
+pub use repair::{RepairOptions, RepairReport};
 pub use rng::Rng;
 pub use sampling::Frame;
 pub use scene::{Material, Scene};

@@ -4,8 +4,11 @@
 //! for each column of the reference, the worst error it met and where. A column is never averaged away: one bad row
 //! fails it. A column that was never compared fails too, and so does one whose worst error is not a number.
 
+pub mod analytic;
 pub mod ggx;
 pub mod metrics;
+pub mod mitsuba;
+pub mod picture;
 pub mod splat;
 
 use std::fmt;
@@ -20,6 +23,10 @@ pub enum OracleKind {
     Splat,
     /// Picture pairs (`NAME.ref.npy`, `NAME.test.npy`) with `metrics.csv` and `flip_hdr.csv`.
     Metrics,
+    /// A CSV table of analytic values of light transport.
+    Analytic,
+    /// Pictures of another path tracer (`refs.json`, `NAME.npy`, `NAME.se.npy`).
+    Mitsuba,
 }
 
 /// The worst disagreement of one reference column.
@@ -123,6 +130,8 @@ pub fn run(kind: OracleKind, path: impl AsRef<Path>) -> Result<OracleReport, Str
         OracleKind::Ggx => ggx::check(path),
         OracleKind::Splat => splat::check(path),
         OracleKind::Metrics => metrics::check(path),
+        OracleKind::Analytic => analytic::check(path),
+        OracleKind::Mitsuba => mitsuba::check(path),
     }
 }
 
