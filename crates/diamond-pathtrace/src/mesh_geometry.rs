@@ -10,15 +10,30 @@ use crate::{Mesh, PathtraceError};
 use glam::{Vec2, Vec3, Vec3A};
 use obvhs::BvhBuildParams;
 use obvhs::aabb::Aabb;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::cwbvh::CwBvh;
+use obvhs::cwbvh::bvh2_to_cwbvh::bvh2_to_cwbvh;
+use obvhs::ploc::PlocBuilder;
 use obvhs::ray::{Ray, RayHit};
-use std::time::Duration;
 
 /// Boxes are widened by this fraction of the mesh's size (its largest coordinate): a few units in the last place of positions.
 const BOX_MARGIN: f32 = 5e-7;
 
 /// Rays that are farther away than this many sizes of the mesh lose all precision and meet nothing.
 const MAX_ORIGIN: f32 = 1e7;
+
+/// The steps of `obvhs`'s own builder, without its check of the result, whose tolerances are absolute and made for units near 1.
+fn build(boxes: &[Aabb], parameters: &BvhBuildParams) -> CwBvh {
+    let mut binary = PlocBuilder::with_capacity(boxes.len()).build(
+        parameters.ploc_search_distance,
+        boxes,
+        (0..boxes.len() as u32).collect(),
+        parameters.sort_precision,
+        parameters.search_depth_threshold,
+    );
+    ReinsertionOptimizer::default().run(&mut binary, parameters.reinsertion_batch_ratio, None);
+    bvh2_to_cwbvh(&binary, parameters.max_prims_per_leaf.clamp(1, 3), true, false)
+}
 
 /// A mesh ready for rays.
 #[derive(Clone)]
@@ -64,7 +79,7 @@ impl MeshGeometry {
             })
             .collect();
         let parameters = BvhBuildParams { pre_split: false, ..BvhBuildParams::medium_build() };
-        let bvh = obvhs::cwbvh::builder::build_cwbvh(&boxes, parameters, &mut Duration::default());
+        let bvh = build(&boxes, &parameters);
         let corners = bvh.primitive_indices.iter().map(|t| scaled(*t as usize).map(|c| c.to_array())).collect();
         let normals =
             (0..mesh.triangles.len()).map(|t| mesh.area_vector(t).normalize_or(glam::DVec3::Z).as_vec3()).collect();

@@ -98,7 +98,7 @@ pub const PACKAGES: &[Package] = &[
     Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(SIMD) },
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2"]),
     Package { name: "diamond-losses", floor: 2, outside: Some(&[]), optional: &[], alone: Some(SIMD) },
-    heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg"]),
+    heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd"]),
     heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2"]),
     heavy(
