@@ -2,12 +2,13 @@
 use crate::stored::StoredImage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Stored images by path, at most `limit` bytes of them. What is in the cache never changes what a caller sees.
 #[derive(Debug)]
 pub(crate) struct ImageCache {
-    limit: usize,
+    limit: AtomicUsize,
     state: Mutex<State>,
 }
 
@@ -21,7 +22,7 @@ struct State {
 
 impl ImageCache {
     pub(crate) fn new(limit: usize) -> Self {
-        Self { limit, state: Mutex::default() }
+        Self { limit: AtomicUsize::new(limit), state: Mutex::default() }
     }
 
     /// The image at `path`, from the cache or from `load`. Loading happens outside the lock, so two threads that ask for
@@ -35,10 +36,17 @@ impl ImageCache {
             return Ok(image);
         }
         let image = Arc::new(load()?);
-        if image.bytes() <= self.limit {
-            self.lock().insert(path, &image, self.limit);
+        let limit = self.limit.load(Ordering::Relaxed);
+        if image.bytes() <= limit {
+            self.lock().insert(path, &image, limit);
         }
         Ok(image)
+    }
+
+    /// Holds at most `limit` bytes from now on; what is beyond is dropped at once.
+    pub(crate) fn set_limit(&self, limit: usize) {
+        self.limit.store(limit, Ordering::Relaxed);
+        self.lock().shrink(limit);
     }
 
     /// Bytes of samples held now.
@@ -69,6 +77,10 @@ impl State {
         self.bytes += image.bytes();
         self.images.insert(path.to_path_buf(), (self.clock, Arc::clone(image)));
         self.by_use.insert(self.clock, path.to_path_buf());
+        self.shrink(limit);
+    }
+
+    fn shrink(&mut self, limit: usize) {
         while self.bytes > limit {
             let Some((_, oldest)) = self.by_use.pop_first() else { return };
             if let Some((_, image)) = self.images.remove(&oldest) {
@@ -106,6 +118,11 @@ mod tests {
         assert_eq!(get("b", 40), 4, "was dropped");
         assert_eq!(get("huge", 101), 5);
         assert_eq!(get("huge", 101), 6, "never kept");
+        assert_eq!(cache.bytes(), 80);
+        cache.set_limit(50);
+        assert_eq!(cache.bytes(), 40, "the older one was dropped");
+        cache.set_limit(0);
+        assert_eq!(cache.bytes(), 0);
     }
 
     #[test]

@@ -59,7 +59,7 @@ pub use geometry::Geometry;
 pub use hash::FileDigest;
 pub use lens::Lens;
 pub use lights::{LightEntry, LightFrame, Lights, parse_lights};
-pub use observation::{Observation, to_display};
+pub use observation::{Observation, StoredForm, to_display};
 pub use scene::{Scene, light_direction};
 pub use select::{Selection, farthest_points};
 pub use write::{BitDepth, CaptureDescription, Pixels, ShotDescription, ViewDescription, write_capture};

@@ -20,7 +20,23 @@ pub struct Observation {
     pub display: Vec<u8>,
 }
 
+/// How an image is kept in memory: as it is in its file, until it is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StoredForm {
+    /// Type of a sample: `8-bit` or `16-bit`, encoded, or `f32`, linear.
+    pub sample: &'static str,
+    /// 1 grey, 2 grey and alpha, 3 RGB, 4 RGBA.
+    pub channels: usize,
+    /// Bytes of all samples.
+    pub bytes: u64,
+}
+
 impl Capture {
+    /// The number of images of the capture as opened, whatever is selected.
+    pub fn image_files(&self) -> usize {
+        self.shared.images.len()
+    }
+
     /// Loads a shot of this capture. Thread-safe and deterministic: what was loaded before changes nothing but time.
     ///
     /// Errors: the file is gone, cut short, no image that can be read, larger than [`crate::OpenOptions::max_pixels`], or its size is not
@@ -81,6 +97,23 @@ impl Capture {
     /// Bytes of stored samples that the cache holds now; at most [`crate::OpenOptions::cache_bytes`].
     pub fn cached_bytes(&self) -> usize {
         self.shared.cache.bytes()
+    }
+
+    /// Keeps at most so many bytes of stored samples from now on, for all selections of this capture, in place of
+    /// [`crate::OpenOptions::cache_bytes`]. Only time depends on it.
+    pub fn limit_cache(&self, bytes: usize) {
+        self.shared.cache.set_limit(bytes);
+    }
+
+    /// How the samples of an image are kept in the cache: decodes it, unless it is there.
+    pub fn stored_form(&self, shot: &Shot) -> Result<StoredForm, DatasetError> {
+        let stored = self.stored(shot)?;
+        let sample = match stored.samples {
+            Samples::Eight(_) => "8-bit",
+            Samples::Sixteen(_) => "16-bit",
+            Samples::Linear(_) => "f32",
+        };
+        Ok(StoredForm { sample, channels: stored.channels, bytes: stored.bytes() as u64 })
     }
 
     pub(crate) fn stored(&self, shot: &Shot) -> Result<Arc<StoredImage>, DatasetError> {

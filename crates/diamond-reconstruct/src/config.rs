@@ -3,7 +3,7 @@
 //! A file may name a `base` preset and say only what differs. Unknown keys are errors, so that a typing mistake never
 //! silently leaves a default in place. Step numbers are fractions of the run's length unless the name says `steps`.
 use crate::error::brief;
-use crate::{InstructionChoice, ReconstructError};
+use crate::{ByteSize, InstructionChoice, ReconstructError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -28,6 +28,10 @@ pub struct Config {
     /// or `neon` (the same bits as each other).
     #[serde(default)]
     pub instruction_set: InstructionChoice,
+    /// What the whole process may take at its peak, such as `"512 MiB"`; without it nothing is limited. What can be lowered
+    /// without changing the result is lowered first, then `density.max_gaussians`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory_limit: Option<ByteSize>,
     /// How images are read.
     pub input: Input,
     /// How the Gaussians begin.
@@ -643,6 +647,12 @@ impl Config {
         self.initial.count.min(self.density.max_gaussians)
     }
 
+    /// The configuration without what only decides time and memory: two runs with the same have the same result.
+    pub fn deciding(&self) -> Self {
+        let input = Input { cache_bytes: 0, ..self.input.clone() };
+        Self { memory_limit: None, input, ..self.clone() }
+    }
+
     /// The configuration as TOML text, complete.
     pub fn to_toml(&self) -> Result<String, ReconstructError> {
         toml::to_string_pretty(self)
@@ -800,5 +810,19 @@ mod tests {
         assert!(error("[loss]\nmask = -1.0").contains("loss.mask"));
         assert!(error("[initial]\nopacity = 1.0").contains("initial.opacity"));
         assert!(error("steps = \"many\"").contains("mine.toml"));
+        assert!(error("memory_limit = \"much\"").contains("512 MiB"), "{}", error("memory_limit = \"much\""));
+    }
+
+    #[test]
+    fn a_memory_limit_is_text_or_bytes_and_decides_nothing_by_itself() {
+        let plain = Config::preset("resolved").unwrap();
+        assert!(!plain.to_toml().unwrap().contains("memory_limit"));
+        for text in ["memory_limit = \"2 GiB\"", "memory_limit = 2147483648"] {
+            let config = Config::parse(text, "mine.toml").unwrap();
+            assert_eq!(config.memory_limit, Some(ByteSize(2 << 30)));
+            let again = Config::parse(&config.to_toml().unwrap(), "round trip").unwrap();
+            assert_eq!(again, config);
+            assert_eq!(config.deciding(), plain.deciding());
+        }
     }
 }

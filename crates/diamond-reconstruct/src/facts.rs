@@ -5,6 +5,7 @@ use crate::region::Region;
 use diamond_dataset::{Capture, Shot, Split};
 use diamond_light::OlatLight;
 use serde::Serialize;
+use std::collections::BTreeSet;
 
 /// Images that are decoded to learn whether there are masks and how much of a picture is filled.
 const LOOK_AT: usize = 8;
@@ -26,6 +27,8 @@ pub struct CaptureFacts {
     pub test_views: usize,
     /// Held-out images.
     pub test_images: usize,
+    /// Most images of a held-out view.
+    pub most_test_lights: usize,
     /// Least and greatest width, pixels.
     pub width: (u32, u32),
     /// Least and greatest height, pixels.
@@ -34,7 +37,13 @@ pub struct CaptureFacts {
     pub points: bool,
     /// Images whose weight in the photometric terms is not 1.
     pub weighted_images: usize,
-    /// Images that were decoded for the two facts below.
+    /// Images of the capture as opened, selected or not, held out or not.
+    pub files: usize,
+    /// How samples are kept in memory, among the images that were looked at: `8-bit RGBA` and the like.
+    pub stored_as: String,
+    /// Most bytes that the samples of one of them take.
+    pub stored_bytes: u64,
+    /// Images that were decoded for the facts above and below.
     pub looked_at: usize,
     /// Images with a mask among them.
     pub masks: usize,
@@ -58,8 +67,14 @@ impl CaptureFacts {
         };
         let looked_at = shots.len().min(LOOK_AT);
         let (mut masks, mut content) = (0, 0.0);
+        let (mut stored_as, mut stored_bytes) = (BTreeSet::new(), 0);
         for i in 0..looked_at {
-            let observation = capture.observation(shots[i * shots.len() / looked_at])?;
+            let shot = shots[i * shots.len() / looked_at];
+            let stored = capture.stored_form(shot)?;
+            let channels = ["", "grey", "grey and alpha", "RGB", "RGBA"][stored.channels.min(4)];
+            stored_as.insert(format!("{} {channels}", stored.sample));
+            stored_bytes = stored.bytes.max(stored_bytes);
+            let observation = capture.observation(shot)?;
             masks += usize::from(observation.mask.is_some());
             let (width, height, _) = observation.radiance.shape();
             let region = Region::of_photograph(&observation.radiance, observation.mask.as_ref());
@@ -73,10 +88,14 @@ impl CaptureFacts {
             lights: lights.len(),
             test_views: capture.test.len(),
             test_images: capture.test.iter().map(|v| v.shots.len()).sum(),
+            most_test_lights: capture.test.iter().map(|v| v.shots.len()).max().unwrap_or(0),
             width: range(|s| s.width),
             height: range(|s| s.height),
             points: capture.points.is_some(),
             weighted_images: shots.iter().filter(|s| s.weight != 1.0).count(),
+            files: capture.image_files(),
+            stored_as: stored_as.into_iter().collect::<Vec<_>>().join(", "),
+            stored_bytes,
             looked_at,
             masks,
             content: (looked_at > 0).then(|| content / looked_at as f64),

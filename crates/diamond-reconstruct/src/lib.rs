@@ -15,6 +15,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 pub mod adam;
+mod byte_size;
 mod channel_layout;
 mod config;
 mod counters;
@@ -42,6 +43,7 @@ mod schedule;
 mod tensor_file;
 mod visibility_cache;
 
+pub use byte_size::ByteSize;
 pub use channel_layout::ChannelLayout;
 pub use config::*;
 pub use counters::Counters;
@@ -57,7 +59,7 @@ pub use objective::TermValue;
 pub use parameters::{Activated, ActivatedGrad, Attribute, GaussianParameters, Group, Layout, logit, sigmoid};
 pub use reconstruction::Reconstruction;
 pub use region::Region;
-pub use render::{RenderWork, Renderer};
+pub use render::{LIGHTS_PER_RASTERISATION, RenderWork, Renderer};
 pub use scene::{InitialPoints, InitialSplats, Scene, survey};
 pub use schedule::StepPlan;
 pub use tensor_file::{TensorFile, tensor_digest, write_atomically};

@@ -28,8 +28,8 @@ use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
-/// Lights whose residuals are blended in one rasterisation: bounds the memory of their channels.
-const LIGHTS_PER_RASTERISATION: usize = 16;
+/// Lights whose residuals are blended in one rasterisation, unless told otherwise: bounds the memory of their channels.
+pub const LIGHTS_PER_RASTERISATION: usize = 16;
 /// From so many lights on it pays to find out which Gaussians pass something to a pixel: it costs about as much as one
 /// light, and spares each light the others.
 const LIGHTS_TO_LOOK_AHEAD: usize = 4;
@@ -41,6 +41,7 @@ pub struct Renderer<'m> {
     needs: RenderNeeds,
     /// Built when the first light needs it.
     tracer: OnceLock<Tracer>,
+    lights_together: usize,
 }
 
 /// Shades a group of lights of a view from their channels.
@@ -68,12 +69,19 @@ impl<'m> Renderer<'m> {
     pub fn new(model: &'m Model) -> Self {
         let activated = model.parameters.activate();
         let needs = Needs::decide(&model.config, &CaptureFacts::default()).rendering(&activated);
-        Self { model, activated, needs, tracer: OnceLock::new() }
+        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_PER_RASTERISATION }
     }
 
     /// Of a model with given decisions on what is computed.
     pub fn with_needs(model: &'m Model, needs: RenderNeeds) -> Self {
-        Self { model, activated: model.parameters.activate(), needs, tracer: OnceLock::new() }
+        let activated = model.parameters.activate();
+        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_PER_RASTERISATION }
+    }
+
+    /// With so many lights blended in one rasterisation (at least 1; [`LIGHTS_PER_RASTERISATION`] unless told otherwise):
+    /// memory and time depend on it, pictures do not.
+    pub fn with_lights_together(self, lights: usize) -> Self {
+        Self { lights_together: lights.max(1), ..self }
     }
 
     /// What is computed, and why.
@@ -232,7 +240,7 @@ impl<'m> Renderer<'m> {
         let view = self.view(camera, lights.len(), layout)?;
         let gaussians = &self.activated.gaussians;
         let per_light = view.per_light.count();
-        for group in lights.chunks(LIGHTS_PER_RASTERISATION) {
+        for group in lights.chunks(self.lights_together) {
             let computed: Vec<Lit> =
                 group.par_iter().map(|light| self.light(&view, light, layout)).collect::<Result<_, _>>()?;
             let mut features = Features::zeros(gaussians.len(), per_light * group.len());

@@ -1,6 +1,8 @@
 //! Named f32 tensors with text metadata in one safetensors file, written so that a crash never leaves half a file.
 use crate::ReconstructError;
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
+use sha2::{Digest, Sha256};
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
@@ -28,14 +30,54 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ReconstructErro
 /// SHA-256 in lower-case hex of tensors' names, lengths and bytes, in the order of their names: what a file holds of
 /// itself to be known as whole.
 pub fn tensor_digest<'a>(tensors: impl Iterator<Item = (&'a String, &'a [u8])>) -> String {
-    use sha2::{Digest, Sha256};
-    let mut hash = Sha256::new();
-    for (name, bytes) in tensors {
-        hash.update(name.as_bytes());
-        hash.update((bytes.len() as u64).to_le_bytes());
-        hash.update(bytes);
+    let mut hash = TensorHash::default();
+    tensors.for_each(|(name, bytes)| hash.add(name, bytes));
+    hash.finish()
+}
+
+/// [`tensor_digest`], a tensor at a time.
+#[derive(Default)]
+struct TensorHash(Sha256);
+
+impl TensorHash {
+    fn add(&mut self, name: &str, bytes: &[u8]) {
+        self.0.update(name.as_bytes());
+        self.0.update((bytes.len() as u64).to_le_bytes());
+        self.0.update(bytes);
     }
-    hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
+
+    fn finish(self) -> String {
+        self.0.finalize().iter().map(|b| format!("{b:02x}")).collect()
+    }
+}
+
+/// Little-endian bytes of values.
+fn bytes_of(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+/// A tensor whose bytes are written elsewhere: only its place in the header is asked for.
+struct Announced<'a> {
+    shape: &'a [usize],
+    values: usize,
+}
+
+impl View for Announced<'_> {
+    fn dtype(&self) -> Dtype {
+        Dtype::F32
+    }
+
+    fn shape(&self) -> &[usize] {
+        self.shape
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(&[])
+    }
+
+    fn data_len(&self) -> usize {
+        4 * self.values
+    }
 }
 
 impl TensorFile {
@@ -45,27 +87,44 @@ impl TensorFile {
         self.tensors.insert(name.into(), (shape.to_vec(), values));
     }
 
-    /// Writes the file, whole or not at all.
+    /// Writes the file, whole or not at all, a tensor at a time.
     pub fn write(&self, path: &Path) -> Result<(), ReconstructError> {
-        write_atomically(path, &self.to_bytes(path)?)
+        let header = self.header(path)?;
+        let written = diamond_splat::write_whole_with(path, |file| {
+            file.write_all(&header)?;
+            self.tensors.values().try_for_each(|(_, values)| file.write_all(&bytes_of(values)))
+        });
+        written.map_err(|failure| ReconstructError::Io {
+            path: path.to_owned(),
+            action: failure.action,
+            source: failure.source,
+        })
     }
 
     /// The bytes of the file; `path` is only named in errors.
     pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, ReconstructError> {
+        let mut bytes = self.header(path)?;
+        self.tensors.values().for_each(|(_, values)| bytes.extend(bytes_of(values)));
+        Ok(bytes)
+    }
+
+    /// What precedes the tensors, which follow in the order of their names: all are of one type.
+    fn header(&self, path: &Path) -> Result<Vec<u8>, ReconstructError> {
         let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
-        let bytes: BTreeMap<&String, Vec<u8>> = self
-            .tensors
-            .iter()
-            .map(|(name, (_, values))| (name, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
-            .collect();
-        let mut metadata: HashMap<String, String> = self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
-        metadata.insert(DIGEST_KEY.into(), tensor_digest(bytes.iter().map(|(n, b)| (*n, b.as_slice()))));
-        let mut views = Vec::with_capacity(bytes.len());
-        for (name, data) in &bytes {
-            let shape = self.tensors[*name].0.clone();
-            views.push((*name, TensorView::new(Dtype::F32, shape, data).map_err(|e| fail(e.to_string()))?));
+        let mut hash = TensorHash::default();
+        for (name, (shape, values)) in &self.tensors {
+            if shape.iter().product::<usize>() != values.len() {
+                return Err(fail(format!("tensor {name}: {} values do not have the shape {shape:?}", values.len())));
+            }
+            hash.add(name, &bytes_of(values));
         }
-        safetensors::serialize(views, Some(metadata)).map_err(|e| fail(e.to_string()))
+        let mut metadata: HashMap<String, String> = self.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
+        metadata.insert(DIGEST_KEY.into(), hash.finish());
+        let views =
+            self.tensors.iter().map(|(name, (shape, values))| (name, Announced { shape, values: values.len() }));
+        let mut header = safetensors::serialize(views, Some(metadata)).map_err(|e| fail(e.to_string()))?;
+        header.shrink_to_fit();
+        Ok(header)
     }
 
     /// Reads and verifies a file that [`TensorFile::write`] wrote.

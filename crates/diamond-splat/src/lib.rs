@@ -36,5 +36,6 @@ pub use ply::{
 };
 pub use projection::{Footprint, Projection, project};
 pub use rasterize::{Raster, RasterGrad, RasterPullback, RasterStats, rasterize, rasterize_projected};
+pub use recycle::{KEPT_BYTES, keep_buffers};
 pub use visibility::{GaussianBvh, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};
-pub use whole_file::{WriteFailure, remove_leftovers, write_whole};
+pub use whole_file::{WriteFailure, remove_leftovers, write_whole, write_whole_with};

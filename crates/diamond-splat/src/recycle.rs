@@ -3,9 +3,19 @@
 //! A training step asks for tens of megabytes and gives them back a moment later. General allocators return such pieces to
 //! the system, which then clears and maps every page again: an eighth of the time of a large picture.
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Bytes that a pool keeps at most: beyond it, memory matters more than the time to map it.
-const KEPT_BYTES: usize = 256 << 20;
+/// Bytes that a pool keeps at most, unless told otherwise: beyond it, memory matters more than the time to map it.
+pub const KEPT_BYTES: usize = 256 << 20;
+
+static KEPT: AtomicUsize = AtomicUsize::new(KEPT_BYTES);
+
+/// How many bytes of buffers the rasteriser keeps, of each of three kinds, from one picture to the next
+/// ([`KEPT_BYTES`] unless told otherwise), in this process: with 0 each picture asks the system anew. What comes out does
+/// not depend on it.
+pub fn keep_buffers(bytes: usize) {
+    KEPT.store(bytes, Ordering::Relaxed);
+}
 
 /// Empty vectors with capacity.
 pub(crate) struct Pool<T> {
@@ -36,7 +46,7 @@ impl<T> Pool<T> {
         vector.clear();
         let bytes = vector.capacity() * size_of::<T>();
         let mut kept = self.kept.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        if bytes > 0 && kept.bytes + bytes <= KEPT_BYTES {
+        if bytes > 0 && kept.bytes + bytes <= KEPT.load(Ordering::Relaxed) {
             kept.bytes += bytes;
             kept.vectors.push(vector);
         }

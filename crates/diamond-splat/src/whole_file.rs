@@ -25,10 +25,18 @@ pub struct WriteFailure {
 /// A link is followed: what it points to is replaced and not the link. Something that is neither file nor folder (a
 /// device, a pipe, `/dev/stdout`) is written to directly, since renaming onto it would put a file in its place.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), WriteFailure> {
+    write_whole_with(path, |file| file.write_all(bytes))
+}
+
+/// [`write_whole`] of what `write` writes, for files that are made piece by piece.
+pub fn write_whole_with(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
+) -> Result<(), WriteFailure> {
     let fail = |action| move |source| WriteFailure { action, source };
     if std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
         let mut device = std::fs::OpenOptions::new().write(true).open(path).map_err(fail("write"))?;
-        return device.write_all(bytes).and_then(|()| device.flush()).map_err(fail("write"));
+        return write(&mut device).and_then(|()| device.flush()).map_err(fail("write"));
     }
     let target = match path.is_symlink() {
         true => path.canonicalize().unwrap_or_else(|_| path.to_owned()),
@@ -42,7 +50,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), WriteFailure> {
     temporary.push(name);
     temporary.push(format!(".{}.{number}.tmp", std::process::id()));
     let temporary = target.with_file_name(temporary);
-    let written = replace(&temporary, &target, bytes);
+    let written = replace(&temporary, &target, write);
     if written.is_err() {
         // Gives the space back; that the removal may fail as well changes nothing.
         let _ = std::fs::remove_file(&temporary);
@@ -56,10 +64,14 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), WriteFailure> {
     Ok(())
 }
 
-fn replace(temporary: &Path, target: &Path, bytes: &[u8]) -> Result<(), WriteFailure> {
+fn replace(
+    temporary: &Path,
+    target: &Path,
+    write: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
+) -> Result<(), WriteFailure> {
     let fail = |action| move |source| WriteFailure { action, source };
     let mut file = std::fs::File::create(temporary).map_err(fail("create a temporary file beside it"))?;
-    file.write_all(bytes).map_err(fail("write"))?;
+    write(&mut file).map_err(fail("write"))?;
     file.sync_all().map_err(fail("sync"))?;
     drop(file);
     std::fs::rename(temporary, target).map_err(fail("rename the temporary file onto it"))

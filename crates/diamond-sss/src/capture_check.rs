@@ -18,9 +18,13 @@ pub fn open_capture(path: &Path, config: &Config) -> Result<Capture, SssError> {
     Ok(Capture::open(path, &options)?)
 }
 
-/// Decodes every image of the capture once; the error is that of the first broken one, in the order of the files.
-pub(crate) fn check_images(capture: &Capture) -> Result<(), DatasetError> {
+/// Decodes every image of the capture once, on all threads or one after the other; the error is that of the first broken
+/// one, in the order of the files.
+pub(crate) fn check_images(capture: &Capture, in_parallel: bool) -> Result<(), DatasetError> {
     let shots: Vec<&Shot> = capture.train.iter().chain(&capture.test).flat_map(|v| &v.shots).collect();
+    if !in_parallel {
+        return shots.iter().try_for_each(|shot| capture.observation(shot).map(|_| ()));
+    }
     let results: Vec<Result<(), DatasetError>> =
         shots.par_iter().map(|shot| capture.observation(shot).map(|_| ())).collect();
     results.into_iter().collect()

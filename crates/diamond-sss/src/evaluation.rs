@@ -4,11 +4,11 @@
 //! peak 1 over all pixels and channels; SSIM with an 11×11 window, zero-padded; FLIP for low dynamic range at 67 pixels
 //! per degree. *Masked* means inside the photograph's mask, that is where coverage exceeds ½. A light is *seen* where it
 //! coincides with a light of the training selection.
-use crate::{SssError, render_lights};
+use crate::{AtOnce, SssError, render_lights};
 use diamond_dataset::{Capture, to_display};
 use diamond_image::{Image, Mask};
 use diamond_metrics::{FlipOptions, SsimWindow, flip_ldr, psnr, psnr_masked, ssim};
-use diamond_reconstruct::{Model, Renderer};
+use diamond_reconstruct::Model;
 
 /// PSNR of identical images is infinite, which JSON cannot say and no mean survives; it is reported as this, dB. Two
 /// different 8-bit images of fewer than 3·10⁹ values are never as close.
@@ -59,7 +59,7 @@ pub fn evaluate_model(
     capture: &Capture,
     mut progress: impl FnMut(usize, usize),
 ) -> Result<Vec<ImageScore>, SssError> {
-    evaluate_with(model, capture, |done, all, _| {
+    evaluate_with(model, &AtOnce::default(), capture, |done, all, _| {
         progress(done, all);
         Ok(())
     })
@@ -67,15 +67,16 @@ pub fn evaluate_model(
 
 pub(crate) fn evaluate_with(
     model: &Model,
+    at_once: &AtOnce,
     capture: &Capture,
     mut each: impl FnMut(usize, usize, Compared<'_>) -> Result<(), SssError>,
 ) -> Result<Vec<ImageScore>, SssError> {
     let total = capture.test.iter().map(|v| v.shots.len()).sum();
     let mut scores = Vec::with_capacity(total);
-    let renderer = Renderer::new(model);
+    let renderer = at_once.renderer(model);
     for (v, view) in capture.test.iter().enumerate() {
         let lights: Vec<_> = view.shots.iter().map(|s| s.light).collect();
-        render_lights(&renderer, &view.camera, &lights, |s, picture| {
+        render_lights(&renderer, at_once, &view.camera, &lights, |s, picture| {
             let shot = &view.shots[s];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);

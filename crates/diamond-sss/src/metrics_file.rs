@@ -253,7 +253,7 @@ pub fn evaluate_folder(
         Some(record) => select_as(&whole, record)?,
         None => whole.clone(),
     };
-    let scores = evaluate_with(&model, &selected, |done, all, compared| {
+    let scores = evaluate_with(&model, &crate::AtOnce::default(), &selected, |done, all, compared| {
         progress(done, all);
         if save_images { save(folder, &compared) } else { Ok(()) }
     })?;

@@ -1,8 +1,8 @@
 //! What a reconstruction will do before it does it: facts of the capture, what is computed and what is left out and why,
 //! when things change during the run, and what it takes. `diamond plan` prints it; a run stores it as `needs.json`.
-use crate::{SssError, open_capture};
+use crate::{MemoryPlan, SssError, open_capture};
 use diamond_dataset::Selection;
-use diamond_reconstruct::{CaptureFacts, Config, Needs, StepPlan};
+use diamond_reconstruct::{ByteSize, CaptureFacts, Config, Needs, StepPlan};
 use serde::Serialize;
 use std::fmt;
 use std::path::PathBuf;
@@ -20,6 +20,8 @@ pub struct PlanOptions {
     pub views: Selection,
     /// Training lights.
     pub lights: Selection,
+    /// Memory limit; the configuration's where absent.
+    pub memory_limit: Option<ByteSize>,
 }
 
 /// Something that changes during a run.
@@ -33,17 +35,9 @@ pub struct Milestone {
     pub what: String,
 }
 
-/// Estimates of memory, bytes, and work per step, multiplications.
+/// Estimates of work per step, multiplications.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Estimate {
-    /// Gaussians at the start and at most.
-    pub gaussians: (usize, usize),
-    /// Parameters, moments, gradients and network rows of as many Gaussians as there may be.
-    pub gaussian_bytes: u64,
-    /// Pictures of one step: channels, shaded maps, their cotangents.
-    pub picture_bytes: u64,
-    /// Decoded images.
-    pub cache_bytes: u64,
     /// Channels that are rasterised while roughness is a constant, and after.
     pub channels: (usize, usize),
     /// Times each training image is seen.
@@ -65,8 +59,10 @@ pub struct Plan {
     pub needs: Needs,
     /// What changes, in order.
     pub schedule: Vec<Milestone>,
-    /// What it takes.
+    /// What it takes in work.
     pub estimate: Estimate,
+    /// What it takes in memory.
+    pub memory: MemoryPlan,
 }
 
 /// The configuration with `settings` laid over it.
@@ -104,11 +100,12 @@ fn configured(preset: &str, settings: &[String]) -> Result<Config, SssError> {
 
 /// Plans a run on a capture. Decodes at most eight images and computes nothing.
 pub fn plan_capture(options: &PlanOptions) -> Result<Plan, SssError> {
-    let config = configured(&options.preset, &options.settings)?;
+    let mut config = configured(&options.preset, &options.settings)?;
+    config.memory_limit = options.memory_limit.or(config.memory_limit);
     let capture = open_capture(&options.capture, &config)?.select(&options.views, &options.lights)?;
     let facts = CaptureFacts::of(&capture)?;
     let needs = Needs::decide(&config, &facts);
-    Ok(Plan::new(&config, facts, needs))
+    Plan::new(&config, facts, needs)
 }
 
 /// The steps of which `f` holds, as the number of steps done at the end of the first and the last of them, and how many.
@@ -139,29 +136,15 @@ fn schedule(config: &Config) -> Vec<Milestone> {
 
 fn estimate(config: &Config, facts: &CaptureFacts, needs: &Needs) -> Estimate {
     let residual = &config.residual;
-    let most = config.density.max_gaussians.max(config.initial.count);
-    let most = if needs.density.needed { most } else { config.initial.count };
-    // Mean, scale, rotation, opacity, normal, base colour, three materials, SH visibility, transfer, codes.
-    let values = 3 + 3 + 4 + 1 + 3 + 3 + 3 + 16 + residual.transfer_width() + residual.codes;
     let inputs = 42 + residual.codes;
     let mut widths = vec![inputs];
     widths.extend(&residual.hidden);
     widths.push(3);
     let products: usize = if residual.network { widths.windows(2).map(|w| w[0] * w[1]).sum() } else { 0 };
-    let rows = if residual.network { 2 * inputs } else { 0 };
     let last = StepPlan::new(config, config.steps.saturating_sub(1));
     let first = StepPlan::new(config, 0);
     let channels = (needs.at(&first).layout.count(), needs.at(&last).layout.count());
-    // Blended channels and their cotangents over the picture; shader's records, maps and cotangents over the rectangle.
-    let content = facts.content.unwrap_or(1.0).max(0.05);
-    let per_pixel = 2.0 * (channels.1 as f64 + 2.0) + content * (2.0 * 16.0 + 3.0 * 24.0 + 40.0);
-    let pixels = facts.pixels();
     Estimate {
-        gaussians: (config.initial.count, most),
-        // Values, two moments, gradient of the raw values and of their meaning.
-        gaussian_bytes: (most * 4 * (5 * values + rows)) as u64,
-        picture_bytes: (per_pixel * 4.0 * pixels as f64) as u64,
-        cache_bytes: (config.input.cache_bytes as u64).min(facts.images as u64 * pixels * 4),
         channels,
         epochs: config.steps as f64 * f64::from(config.accumulate) / facts.images.max(1) as f64,
         // Once forward, and backward once more forward and twice back.
@@ -170,16 +153,20 @@ fn estimate(config: &Config, facts: &CaptureFacts, needs: &Needs) -> Estimate {
 }
 
 impl Plan {
-    /// Of a configuration, with what is known of the capture and was decided.
-    pub fn new(config: &Config, capture: CaptureFacts, needs: Needs) -> Self {
-        Self {
+    /// Of a configuration, with what is known of the capture and was decided. Refused where the run does not fit the
+    /// configuration's memory limit.
+    pub fn new(config: &Config, capture: CaptureFacts, needs: Needs) -> Result<Self, SssError> {
+        let memory =
+            MemoryPlan::new(config, &capture, &needs).map_err(|refused| SssError::Usage(refused.to_string()))?;
+        Ok(Self {
+            memory,
             preset: config.name.clone(),
             steps: config.steps,
             schedule: schedule(config),
             estimate: estimate(config, &capture, &needs),
             capture,
             needs,
-        }
+        })
     }
 
     /// The plan as JSON.
@@ -196,10 +183,6 @@ impl Plan {
 
 fn span((low, high): (u32, u32)) -> String {
     if low == high { low.to_string() } else { format!("{low}–{high}") }
-}
-
-fn mebibytes(bytes: u64) -> String {
-    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
 
 impl fmt::Display for Plan {
@@ -222,16 +205,9 @@ impl fmt::Display for Plan {
         }
         writeln!(f, "estimates:")?;
         writeln!(f, "  each image is seen {:.1} times", e.epochs)?;
-        writeln!(f, "  {} Gaussians at the start at most, {} later", e.gaussians.0, e.gaussians.1)?;
         writeln!(f, "  {} of 14 channels rasterised, {} at the end", e.channels.0, e.channels.1)?;
         writeln!(f, "  {:.2e} multiplications of the network per step at the start", e.network_multiplications as f64)?;
-        writeln!(
-            f,
-            "  memory: Gaussians {}, pictures of a step {}, images {}",
-            mebibytes(e.gaussian_bytes),
-            mebibytes(e.picture_bytes),
-            mebibytes(e.cache_bytes)
-        )
+        write!(f, "{}", self.memory)
     }
 }
 
@@ -257,7 +233,7 @@ mod tests {
         let config = configured("resolved", &["loss.normal=0".to_owned()]).unwrap();
         let facts = CaptureFacts { images: 10, width: (64, 64), height: (48, 48), ..Default::default() };
         let needs = Needs::decide(&config, &facts);
-        let plan = Plan::new(&config, facts, needs);
+        let plan = Plan::new(&config, facts, needs).unwrap();
         let text = plan.to_string();
         for expected in ["loss.normal = 0", "rounds of density control", "64×48", "12 of 14 channels", "MiB"] {
             assert!(text.contains(expected), "{expected} in {text}");

@@ -68,8 +68,9 @@ fn run(command: Command) -> Result<(), SssError> {
             written.iter().for_each(|path| print(&format!("{}\n", path.display())));
             Ok(())
         }
-        Command::Plan { capture, preset, settings, views, lights, json } => {
-            let plan = diamond_sss::plan_capture(&PlanOptions { capture, preset, settings, views, lights })?;
+        Command::Plan { capture, preset, settings, views, lights, memory_limit, json } => {
+            let plan =
+                diamond_sss::plan_capture(&PlanOptions { capture, preset, settings, views, lights, memory_limit })?;
             match json {
                 true => print(&format!("{:#}\n", plan.to_json()?)),
                 false => print(&plan.to_string()),

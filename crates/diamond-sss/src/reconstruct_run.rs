@@ -2,11 +2,15 @@
 use crate::capture_check::{check_images, open_capture};
 use crate::evaluation::evaluate_with;
 use crate::output_file::write_json;
+use crate::peak_memory::PeakAfter;
 use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
-use crate::{Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
+use crate::{AtOnce, Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
 use diamond_dataset::{Capture, Selection};
-use diamond_reconstruct::{Config, InitialSource, InstructionChoice, ReconstructError, Reconstruction, StepReport};
+use diamond_reconstruct::{
+    ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
+    StepReport,
+};
 use diamond_splat::remove_leftovers;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -30,6 +34,8 @@ pub struct ReconstructOptions {
     pub threads: Option<usize>,
     /// Instruction set; the configuration's where absent.
     pub instruction_set: Option<InstructionChoice>,
+    /// What the process may take in memory at its peak; the configuration's where absent.
+    pub memory_limit: Option<ByteSize>,
     /// Training views.
     pub views: Selection,
     /// Training lights.
@@ -55,6 +61,7 @@ impl ReconstructOptions {
             seed: None,
             threads: None,
             instruction_set: None,
+            memory_limit: None,
             views: Selection::All,
             lights: Selection::All,
             initial: None,
@@ -70,6 +77,7 @@ impl ReconstructOptions {
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
         config.instruction_set = self.instruction_set.unwrap_or(config.instruction_set);
+        config.memory_limit = self.memory_limit.or(config.memory_limit);
         if self.initial.is_some() {
             config.initial.source = InitialSource::Points;
         }
@@ -209,7 +217,7 @@ fn run(
     interrupted: &AtomicBool,
 ) -> Result<Outcome, SssError> {
     let begun = Instant::now();
-    let config = options.config()?;
+    let mut config = options.config()?;
     let instruction_set = config.instruction_set.apply().map_err(|e| SssError::Usage(e.to_string()))?;
     let folder = options.output.as_path();
     let checkpoint = folder.join("checkpoint");
@@ -224,11 +232,25 @@ fn run(
     whole.notes.iter().for_each(|note| events(Event::Note(note.clone())));
     // Before anything is decoded: from here on a file whose content changes is refused when it is read.
     let capture_hash = whole.hash()?;
-    check_images(&whole)?;
     let mut capture = whole.select(&options.views, &options.lights)?;
     if let Some(path) = &options.initial {
         capture.points = Some(path.clone());
     }
+    let mut limited = None;
+    if config.memory_limit.is_some() {
+        let facts = CaptureFacts::of(&capture)?;
+        let needs = Needs::decide(&config, &facts);
+        let plan = Plan::new(&config, facts, needs)?;
+        events(Event::Note(plan.memory.to_string().trim_end().to_owned()));
+        plan.memory.apply(&mut config);
+        limited = Some(plan);
+    }
+    let at_once = limited.as_ref().map_or_else(|| AtOnce::of(&config), |plan| plan.memory.at_once.clone());
+    whole.limit_cache(at_once.photographs as usize);
+    diamond_splat::keep_buffers(at_once.buffers as usize);
+    check_images(&whole, at_once.decode_in_parallel)?;
+    let mut peak_after = PeakAfter::default();
+    peak_after.note("opening");
     std::fs::create_dir_all(folder).map_err(SssError::io(folder, "create the folder"))?;
     for folder in [folder.to_owned(), checkpoint.clone(), folder.join("images")] {
         for path in remove_leftovers(&folder) {
@@ -249,6 +271,7 @@ fn run(
         }
         Reconstruction::new(capture.clone(), &config)?
     };
+    peak_after.note("first Gaussians");
     let mut log = match resumed {
         true => TrainingLog::read_until(&folder.join("log.csv"), config.steps, training.steps_done()),
         false => TrainingLog::new(config.steps),
@@ -257,7 +280,10 @@ fn run(
     record.instruction_set = instruction_set.to_string();
     record.write(folder)?;
     events(Event::Note(format!("first Gaussians: {}", training.initial_origin)));
-    let plan = Plan::new(&config, training.facts().clone(), training.needs().clone());
+    let plan = match limited {
+        Some(plan) => plan,
+        None => Plan::new(&config, training.facts().clone(), training.needs().clone())?,
+    };
     write_json(&folder.join("needs.json"), &plan.to_json()?)?;
     events(Event::Note(plan.summary()));
     events(Event::Started { done: training.steps_done(), steps: config.steps, images: training.pair_count() });
@@ -294,6 +320,9 @@ fn run(
         log.push(&report);
         events(Event::Step { report: &report, psnr: log.running_psnr().unwrap_or(0.0) });
         let stop = interrupted.load(Ordering::SeqCst);
+        if training.finished() {
+            peak_after.note("steps");
+        }
         if training.checkpoint_due() || training.finished() || stop {
             log.flush();
             save(&mut training, &log)?;
@@ -303,17 +332,19 @@ fn run(
             return Err(SssError::Interrupted { step: training.steps_done(), folder: folder.to_owned() });
         }
     }
+    peak_after.note("checkpoint");
     training.model()?.save(folder)?;
     let now = spent(&training);
-    write_profile(folder, config.steps, &now)?;
+    write_profile(folder, config.steps, &now, &peak_after)?;
     let model = training.model()?;
-    let scores = evaluate_with(model, &capture, |done, all, _| {
+    let scores = evaluate_with(model, &at_once, &capture, |done, all, _| {
         events(Event::Evaluated { done, all });
         match interrupted.load(Ordering::SeqCst) {
             true => Err(SssError::Interrupted { step: config.steps, folder: folder.to_owned() }),
             false => Ok(()),
         }
     })?;
+    peak_after.note("evaluation");
     let seconds = earlier.seconds + begun.elapsed().as_secs_f64();
     let peak = peak_bytes().max(earlier.peak_bytes);
     record.seconds = Some(seconds);
@@ -331,7 +362,20 @@ fn run(
         trained_on: None,
     };
     metrics.write(folder)?;
-    write_report(folder, model, &capture, &metrics, &record, &log)?;
+    write_report(folder, model, &capture, &metrics, &record, &log, &at_once)?;
+    peak_after.note("report");
+    write_profile(folder, config.steps, &Costs { peak_bytes: peak_bytes().max(now.peak_bytes), ..now }, &peak_after)?;
+    if let (Some(limit), Some(peak)) = (plan.memory.limit, peak_bytes())
+        && peak > limit
+    {
+        events(Event::Note(format!(
+            "the memory limit of {} was exceeded: the peak was {}, {} were planned (see `peak_bytes_after` in \
+             profile.json); the results are not affected. Lower density.max_gaussians or the limit",
+            ByteSize(limit),
+            ByteSize(peak).rounded(),
+            ByteSize(plan.memory.peak).rounded()
+        )));
+    }
     Ok(Outcome { gaussians: model.len(), metrics: Some(metrics), seconds })
 }
 
@@ -368,7 +412,7 @@ fn add_sums<T: Copy + std::ops::AddAssign>(earlier: &[(String, T)], now: &[(&'st
     out
 }
 
-fn write_profile(folder: &Path, steps: u64, costs: &Costs) -> Result<(), SssError> {
+fn write_profile(folder: &Path, steps: u64, costs: &Costs, peak_after: &PeakAfter) -> Result<(), SssError> {
     let in_steps: f64 = costs.profile.iter().map(|(_, s)| s).sum();
     let parts: serde_json::Map<String, serde_json::Value> =
         costs.profile.iter().map(|(name, s)| (name.clone(), (*s).into())).collect();
@@ -382,6 +426,7 @@ fn write_profile(folder: &Path, steps: u64, costs: &Costs) -> Result<(), SssErro
         "steps": steps,
         "steps_per_second": if in_steps > 0.0 { Some(steps as f64 / in_steps) } else { None },
         "peak_bytes": costs.peak_bytes,
+        "peak_bytes_after": peak_after,
     });
     write_json(&folder.join("profile.json"), &value)
 }

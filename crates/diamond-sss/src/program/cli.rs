@@ -1,7 +1,7 @@
 //! The words of the command line.
 use clap::{Args, Parser, Subcommand};
 use diamond_dataset::Selection;
-use diamond_reconstruct::InstructionChoice;
+use diamond_reconstruct::{ByteSize, InstructionChoice};
 use diamond_splat_files::{SplatFormat, WriteOptions};
 use diamond_sss::ExportOptions;
 use std::path::PathBuf;
@@ -45,6 +45,9 @@ pub enum Command {
         /// Training lights: a count, or indices such as 0,5,7 or 0-7
         #[arg(long, default_value = "all")]
         lights: Selection,
+        /// What the process may take in memory: 512MiB, 2GiB, bytes [default: the configuration, else no limit]
+        #[arg(long, value_name = "SIZE")]
+        memory_limit: Option<ByteSize>,
         /// As JSON
         #[arg(long)]
         json: bool,
@@ -152,6 +155,7 @@ fn splat_format(text: &str) -> Result<SplatFormat, String> {
   diamond reconstruct capture -o out --views 3 --lights 3 --steps 3000
   diamond reconstruct capture -o out --preset mine.toml --seed 7
   diamond reconstruct capture -o out --initial splats.ply
+  diamond reconstruct capture -o out --memory-limit 2GiB
   diamond reconstruct capture -o out --resume")]
 pub struct ReconstructArguments {
     /// The capture: a folder with transforms_train.json
@@ -174,6 +178,10 @@ pub struct ReconstructArguments {
     /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: the configuration]
     #[arg(long, value_name = "NAME")]
     pub instruction_set: Option<InstructionChoice>,
+    /// What the process may take in memory: 512MiB, 2GiB, bytes. Caches shrink first, which changes no result, then the
+    /// number of Gaussians, which is said [default: the configuration, else no limit]
+    #[arg(long, value_name = "SIZE")]
+    pub memory_limit: Option<ByteSize>,
     /// Training views: a count, or indices such as 0,5,7 or 0-7
     #[arg(long, default_value = "all")]
     pub views: Selection,

@@ -29,6 +29,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         seed: a.seed,
         threads: a.threads.map(usize::from),
         instruction_set: a.instruction_set,
+        memory_limit: a.memory_limit,
         views: a.views,
         lights: a.lights,
         initial: a.initial,

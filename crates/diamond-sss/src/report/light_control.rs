@@ -2,11 +2,11 @@
 //! sum of such pictures in linear light is the picture under all these lights at once.
 use super::maps::data_uri;
 use crate::picture::encode_png_linear;
-use crate::{SssError, render_lights};
+use crate::{AtOnce, SssError, render_lights};
 use diamond_camera::Camera;
 use diamond_dataset::{farthest_points, light_direction};
 use diamond_light::OlatLight;
-use diamond_reconstruct::{Model, Renderer};
+use diamond_reconstruct::Model;
 use glam::Vec3;
 use serde_json::{Value, json};
 
@@ -17,7 +17,7 @@ const MAX_SIDE: u32 = 384;
 
 /// The data of the control: a picture per light, and the light's direction in the axes of the camera (x right, y up, z
 /// toward the viewer).
-pub fn light_control(model: &Model, camera: &Camera, rig: &[OlatLight]) -> Result<Value, SssError> {
+pub fn light_control(model: &Model, at_once: &AtOnce, camera: &Camera, rig: &[OlatLight]) -> Result<Value, SssError> {
     let centre = model.scene.centre();
     let directions: Vec<Vec3> = rig.iter().map(|l| light_direction(l, centre)).collect();
     let chosen: Vec<OlatLight> = farthest_points(&directions, MAX_LIGHTS).into_iter().map(|i| rig[i]).collect();
@@ -30,7 +30,7 @@ pub fn light_control(model: &Model, camera: &Camera, rig: &[OlatLight]) -> Resul
         *camera
     };
     let mut lights = Vec::new();
-    render_lights(&Renderer::new(model), &camera, &chosen, |i, picture| {
+    render_lights(&at_once.renderer(model), at_once, &camera, &chosen, |i, picture| {
         let d = camera.pose.rotation * light_direction(&chosen[i], centre);
         lights.push(json!({
             "direction": [d.x, -d.y, -d.z],

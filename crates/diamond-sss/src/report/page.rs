@@ -3,11 +3,11 @@ use super::chart::{chart, smooth};
 use super::light_control::light_control;
 use super::maps::{data_uri, map_pictures};
 use crate::picture::{encode_png_linear, encode_png_rgb, heat_bytes};
-use crate::{Metrics, RunRecord, SssError, TrainingLog, render_lights, write_output};
+use crate::{AtOnce, Metrics, RunRecord, SssError, TrainingLog, render_lights, write_output};
 use diamond_dataset::{Capture, Shot, View};
 use diamond_image::Image;
 use diamond_metrics::{FlipOptions, flip_ldr};
-use diamond_reconstruct::{CaptureFacts, Model, Needs, Renderer};
+use diamond_reconstruct::{CaptureFacts, Model, Needs};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -28,15 +28,16 @@ pub fn write_report(
     metrics: &Metrics,
     record: &RunRecord,
     log: &TrainingLog,
+    at_once: &AtOnce,
 ) -> Result<(), SssError> {
     let (views, held_out) = if capture.test.is_empty() { (&capture.train, false) } else { (&capture.test, true) };
     let Some(view) = views.first() else { return Err(SssError::Internal("a capture without views".into())) };
     let mut body = String::new();
     headline(&mut body, metrics);
     let rig = rig_for(capture, view);
-    let control = light_control(model, &view.camera, &rig)?;
+    let control = light_control(model, at_once, &view.camera, &rig)?;
     body += include_str!("light_control.html");
-    body += &comparisons(model, capture, views, held_out)?;
+    body += &comparisons(model, at_once, capture, views, held_out)?;
     body += "<section><h2>Course of the run</h2><div class=\"charts\">";
     let curve = |f: &dyn Fn(&crate::LogRow) -> f64| -> Vec<(f64, f64)> {
         smooth(&log.rows.iter().map(|r| (r.step as f64, f(r))).collect::<Vec<_>>(), CURVE_POINTS)
@@ -126,16 +127,22 @@ fn spread(views: &[View]) -> Vec<(&View, Vec<&Shot>)> {
     out.into_iter().map(|(v, shots)| (&views[v], shots)).collect()
 }
 
-fn comparisons(model: &Model, capture: &Capture, views: &[View], held_out: bool) -> Result<String, SssError> {
+fn comparisons(
+    model: &Model,
+    at_once: &AtOnce,
+    capture: &Capture,
+    views: &[View],
+    held_out: bool,
+) -> Result<String, SssError> {
     let kind = if held_out { "held-out images" } else { "training images (there are no held-out ones)" };
     let mut out = format!(
         "<section><h2>Photograph and render</h2><p>Some {kind}. The error map is FLIP: the difference that an observer \
          sees, black for none, pale yellow for 1.</p><div class=\"rows\">"
     );
-    let renderer = Renderer::new(model);
+    let renderer = at_once.renderer(model);
     for (view, shots) in spread(views) {
         let lights: Vec<_> = shots.iter().map(|s| s.light).collect();
-        render_lights(&renderer, &view.camera, &lights, |i, radiance| {
+        render_lights(&renderer, at_once, &view.camera, &lights, |i, radiance| {
             let shot = shots[i];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);

@@ -23,10 +23,10 @@ pub fn small_config(dir: &Path) -> PathBuf {
     path
 }
 
-fn camera(i: usize) -> Camera {
+fn camera(i: usize, side: u32) -> Camera {
     let phi = i as f32 * 2.1;
-    let eye = Vec3::new(3.0 * phi.cos(), 3.0 * phi.sin(), 1.0 + 0.3 * i as f32);
-    Camera { intrinsics: Intrinsics::from_fov_x(0.8, 32, 32), pose: Pose::look_at(eye, Vec3::ZERO, Vec3::Z) }
+    let eye = Vec3::new(3.0 * phi.cos(), 3.0 * phi.sin(), 1.0 + 0.3 * (i % 8) as f32);
+    Camera { intrinsics: Intrinsics::from_fov_x(0.8, side, side), pose: Pose::look_at(eye, Vec3::ZERO, Vec3::Z) }
 }
 
 fn light(i: usize) -> OlatLight {
@@ -36,9 +36,10 @@ fn light(i: usize) -> OlatLight {
 
 /// Lambert's ball of radius 0.8 under one light.
 fn photograph(camera: &Camera, light: &OlatLight) -> (Image, Option<Mask>) {
-    let (mut radiance, mut coverage) = (Image::new(32, 32, 3), vec![0.0; 32 * 32]);
-    for y in 0..32 {
-        for x in 0..32 {
+    let side = camera.intrinsics.width as usize;
+    let (mut radiance, mut coverage) = (Image::new(side, side, 3), vec![0.0; side * side]);
+    for y in 0..side {
+        for x in 0..side {
             let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
             let b = ray.origin.dot(ray.direction);
             let discriminant = b * b - ray.origin.length_squared() + 0.64;
@@ -47,17 +48,22 @@ fn photograph(camera: &Camera, light: &OlatLight) -> (Image, Option<Mask>) {
                 let l = (light.position().unwrap() - p).normalize();
                 let shade = 0.1 + 0.7 * p.normalize().dot(l).max(0.0);
                 radiance.pixel_mut(x, y).copy_from_slice(&[shade, 0.7 * shade, 0.5 * shade]);
-                coverage[y * 32 + x] = 1.0;
+                coverage[y * side + x] = 1.0;
             }
         }
     }
-    (radiance, Some(Mask::from_vec(32, 32, coverage).unwrap()))
+    (radiance, Some(Mask::from_vec(side, side, coverage).unwrap()))
 }
 
-/// Writes a capture of `views` × `lights` at 32², and one held-out view under a seen and an unseen light.
+/// [`ball_capture`] at 32².
 pub fn tiny_capture(dir: &Path, views: usize, lights: usize) {
+    ball_capture(dir, views, lights, 32, 2);
+}
+
+/// Writes a capture of `views` × `lights` at `side`², and one held-out view under `held_out` lights, the last one unseen.
+pub fn ball_capture(dir: &Path, views: usize, lights: usize, side: u32, held_out: usize) {
     let view = |i: usize, lights: &[usize]| ViewDescription {
-        camera: camera(i),
+        camera: camera(i, side),
         shots: lights
             .iter()
             .map(|&l| ShotDescription {
@@ -69,9 +75,10 @@ pub fn tiny_capture(dir: &Path, views: usize, lights: usize) {
             .collect(),
     };
     let all: Vec<usize> = (0..lights).collect();
+    let shown: Vec<usize> = (0..held_out - 1).chain([lights]).collect();
     let description = CaptureDescription {
         train: (0..views).map(|i| view(i, &all)).collect(),
-        test: vec![view(views, &[0, lights])],
+        test: vec![view(views, &shown)],
         ..Default::default()
     };
     write_capture(dir, &description, |split, v, s| {

@@ -6,6 +6,8 @@ mod changed_capture;
 #[cfg(unix)]
 mod disk;
 mod killed;
+#[cfg(unix)]
+mod memory_limit;
 mod sessions;
 
 use captures::{scratch, small_config, tiny_capture};

@@ -1,0 +1,235 @@
+//! What is held in each moment of a run, part by part.
+//!
+//! The numbers of bytes per Gaussian, per pixel and per light are sums over the arrays that live then, in the order in
+//! which the code makes them; docs/decisions/0020-memory-limit.md compares the sums with measurements. Where the content
+//! of the photographs decides, which is not known beforehand, a constant below says what is assumed.
+use super::AtOnce;
+use diamond_reconstruct::{
+    Attribute, CaptureFacts, Config, ExposureMode, IncidentVariant, InitialSource, Layout, Needs, StepPlan,
+};
+use serde::Serialize;
+
+/// The program, its threads and tables.
+const PROGRAM: f64 = 11.0 * MIB;
+/// Frames of the capture's files, names and cameras of an image: read, selected and kept.
+const PER_IMAGE: f64 = 4096.0;
+/// Photographs that are decoded at the same time at the start.
+const DECODERS: f64 = 4.0;
+/// A photograph from file to radiance, per pixel: its bytes, decoded samples, radiance, mask, display.
+const DECODING: f64 = 35.0;
+/// A photograph as a step sees it: radiance 12, mask 4, display 3.
+const OBSERVATION: f64 = 19.0;
+/// The mask of a view, and its sums for the visual hull.
+const HULL_MASK: f64 = 8.0;
+/// Standard deviation of a Gaussian over the distance of its neighbours.
+const OVERLAP: f64 = 1.0;
+/// Width of a footprint over its standard deviation.
+const FOOTPRINT: f64 = 5.0;
+/// The rasteriser's regions, pixels.
+const REGION: [f64; 2] = [64.0, 32.0];
+/// Threads that the rasteriser's own copies of regions are counted for.
+const THREADS: f64 = 8.0;
+/// Block lists of the rasteriser, per pixel of the content.
+const LISTS: f64 = 12.0;
+/// The hierarchy over the Gaussians for rays: packets and nodes.
+const HIERARCHY: f64 = 110.0;
+/// The objective's pictures, per pixel of the content: encoded pictures, windows, their cotangents.
+const OBJECTIVE: f64 = 100.0;
+/// Both pictures, SSIM and FLIP (in double precision) of one comparison, per pixel.
+const COMPARISON: f64 = 300.0;
+/// The page's text over the pictures in it: half as long as PNG, a third longer as text, and three copies while the page is
+/// put together.
+const PAGE: f64 = 0.5 * 4.0 / 3.0 * 3.0;
+/// Arrays beyond this come from the system anew (glibc's largest threshold), and only what is written to counts.
+const FRESH: f64 = 32.0 * MIB;
+/// Share of what the steps needed and gave back that later parts cannot use again: measured, 0.15 to 0.3.
+const NOT_REUSED: f64 = 0.3;
+/// The rectangle of a render over that of the photograph.
+const MARGIN: f64 = 1.2;
+const MIB: f64 = 1048576.0;
+/// Lights of which visibility is kept.
+const VISIBILITY_LIGHTS: usize = 512;
+
+/// Something that is held.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Part {
+    /// What.
+    pub name: &'static str,
+    /// Bytes.
+    pub bytes: u64,
+}
+
+/// A moment of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Moment {
+    /// Its name in `profile.json`.
+    pub name: &'static str,
+    /// What is held then, in the order of the run.
+    pub parts: Vec<Part>,
+}
+
+impl Moment {
+    fn new(name: &'static str, parts: &[(&'static str, f64)]) -> Self {
+        let part = |&(name, bytes): &(&'static str, f64)| Part { name, bytes: bytes.max(0.0) as u64 };
+        Self { name, parts: parts.iter().map(part).filter(|p| p.bytes > 0).collect() }
+    }
+
+    /// Bytes of all parts.
+    pub fn bytes(&self) -> u64 {
+        self.parts.iter().map(|p| p.bytes).sum()
+    }
+}
+
+/// Slots per Gaussian: regions that its footprint meets, on average, where `n` Gaussians cover `content` pixels, half of
+/// them on the side that is seen.
+fn slots_per_gaussian(n: f64, content: f64, pixels: f64) -> f64 {
+    let side = FOOTPRINT * OVERLAP * (2.0 * content / n.max(1.0)).sqrt();
+    let regions = (pixels / (REGION[0] * REGION[1])).ceil();
+    ((1.0 + side / REGION[0]) * (1.0 + side / REGION[1])).min(regions.max(1.0))
+}
+
+/// What is held in each moment of a run with `gaussians` Gaussians.
+pub fn moments(
+    config: &Config,
+    facts: &CaptureFacts,
+    needs: &Needs,
+    at_once: &AtOnce,
+    gaussians: usize,
+) -> Vec<Moment> {
+    let n = gaussians as f64;
+    let of = |condition: bool, value: f64| if condition { value } else { 0.0 };
+    let pixels = facts.pixels() as f64;
+    let content = (MARGIN * facts.content.unwrap_or(1.0)).clamp(0.05, 1.0) * pixels;
+    let residual = &config.residual;
+    // Numbers of a Gaussian, and those of them that are learned row by row.
+    let layout = Layout::of(config);
+    let values: f64 = Attribute::ALL.iter().map(|&a| layout.width(a) as f64).sum();
+    let row_values = (residual.codes + residual.transfer_width()) as f64;
+    let inputs = of(residual.network, (42 + residual.codes) as f64);
+    let first_layer = of(residual.network, residual.hidden.first().map_or(0.0, |&w| w as f64));
+    let last = needs.at(&StepPlan::new(config, config.steps.saturating_sub(1)));
+    let channels = last.layout.count() as f64;
+    let per_light = 4.0 + of(config.shading.incident == IncidentVariant::Learned, 1.0);
+    let fixed = 9.0;
+    let stride = |channels: f64| ((channels + 1.0) / 16.0).ceil() * 16.0;
+    let slots = slots_per_gaussian(n, content, pixels);
+    let regions = (pixels / (REGION[0] * REGION[1])).ceil().max(1.0);
+    // The share of the picture whose regions hold something, and an array over the whole picture of which that is filled.
+    let filled = (MARGIN * content / pixels.max(1.0)).min(1.0);
+    let array = |bytes: f64| if bytes > FRESH { filled * bytes } else { bytes };
+
+    let files = facts.files.max(facts.images + facts.test_images) as f64;
+    let program = ("program and lists of the capture", PROGRAM + PER_IMAGE * files);
+    let photographs = ("photographs", (files * facts.stored_bytes as f64).min(at_once.photographs as f64));
+    let decoders = if at_once.decode_in_parallel { DECODERS } else { 1.0 };
+    let mut all = vec![Moment::new("opening", &[program, photographs, ("decoding", decoders * DECODING * pixels)])];
+
+    let hull = facts.masks > 0
+        && match config.initial.source {
+            InitialSource::Auto => !facts.points,
+            InitialSource::Hull => true,
+            InitialSource::Points | InitialSource::Uniform => false,
+        };
+    let learned_light = config.shading.incident == IncidentVariant::Learned;
+    let bright = of(!learned_light, 1.5 * 4.0 * content * facts.images.min(64) as f64);
+    let hull_bytes = HULL_MASK * pixels * facts.views as f64 + (config.initial.hull_resolution as f64).powi(3);
+    let survey = [
+        program,
+        photographs,
+        ("one photograph", DECODING * pixels),
+        // One after the other.
+        ("visual hull and brightness", of(hull, hull_bytes).max(bright)),
+    ];
+    all.push(Moment::new("first Gaussians", &survey));
+
+    let traced = config.visibility.traced && needs.traced_visibility.needed;
+    let gains = match config.exposure.mode {
+        ExposureMode::PerImage => 64.0 * facts.images as f64,
+        _ => 0.0,
+    };
+    let parameters = ("Gaussians: values and two moments", n * (12.0 * values + 12.0) + gains);
+    let kept_lights = facts.lights.min(VISIBILITY_LIGHTS) as f64;
+    let visibility = ("visibility", of(traced, n * (4.0 * kept_lights + 44.0 + HIERARCHY)));
+    let kept = at_once.buffers as f64;
+
+    // A step: where the rasteriser runs backward, and where the residual does.
+    let activated = n * (80.0 + 44.0);
+    let rows = n * (80.0 + 4.0 * row_values + 20.0 + 28.0 + 4.0 * inputs);
+    let projection = n * (80.0 + 72.0 * slots);
+    let scratch = (THREADS / regions).min(1.0) * n * slots * (80.0 + 4.0 * stride(channels));
+    let line = 4.0 * (8.0 + stride(channels));
+    let backward = n * slots * line;
+    let region_data = 4.0 * (channels + 2.0) * pixels * filled;
+    let pulled = n * (52.0 + 4.0 * channels);
+    let features = n * 4.0 * channels;
+    let images = 2.0 * array(pixels * 4.0 * (channels + 2.0)) + pixels * OBSERVATION * f64::from(config.accumulate);
+    let shaded = content * (56.0 + 8.0 + 96.0 + 96.0 + 64.0 + LISTS + OBJECTIVE);
+    let slot_pool = (n * slots * 64.0).min(kept);
+    let common = [program, photographs, parameters, visibility];
+    let out = n * (36.0 + 4.0 * row_values);
+    let backward_of_rasteriser = [
+        ("rasteriser", projection + scratch + backward.max(region_data) + pulled + slot_pool + features),
+        ("activations and gradients", activated),
+        ("network and its rows", rows),
+    ];
+    let backward_of_residual = [
+        ("rasteriser", projection + scratch + backward.max(region_data).min(kept) + pulled + slot_pool + features),
+        ("activations and gradients", activated + out),
+        ("network and its rows", rows + n * (32.0 + 4.0 * 3.0 * inputs)),
+    ];
+    let adam = [
+        ("rasteriser", scratch + backward.max(region_data).min(kept) + slot_pool),
+        ("activations and gradients", n * (80.0 + 80.0 + 4.0 * (row_values + 16.0) + 4.0 * values)),
+    ];
+    let pictures = ("pictures of a step", images + shaded);
+    let largest = [&backward_of_rasteriser[..], &backward_of_residual[..], &adam[..]]
+        .into_iter()
+        .map(|now| [&common[..], &[pictures], now].concat())
+        .map(|parts| Moment::new("steps", &parts))
+        .max_by_key(Moment::bytes);
+    let transient =
+        largest.as_ref().map_or(0.0, |m| m.bytes() as f64) - common.iter().map(|(_, bytes)| bytes).sum::<f64>();
+    let left = ("not used again since the steps", NOT_REUSED * transient);
+    all.extend(largest);
+
+    // A checkpoint: a copy of everything that it holds, then a tensor at a time.
+    let pooled = ("rasteriser", (backward.max(region_data)).min(kept) + slot_pool + scratch);
+    let copy = n * (12.0 * values + 12.0 + of(traced, 4.0 * kept_lights + 44.0));
+    let tensor = 4.0 * n * (residual.transfer_width() as f64).max(16.0);
+    all.push(Moment::new("checkpoint", &[&common[..], &[left, pooled, ("copy for the file", copy + tensor)]].concat()));
+
+    // A view under its lights.
+    let view = |name: &'static str, lights: usize, pixels: f64, content: f64, besides: (&'static str, f64)| {
+        let together = lights.min(at_once.lights) as f64;
+        let pictures = lights.min(at_once.pictures_together(pixels as u64)) as f64;
+        let rows = n * (80.0 + 4.0 * row_values + 4.0 * inputs.max(first_layer));
+        // What is found out about a view for many lights, and one group of lights.
+        let of_view = n * (4.0 * fixed + slots * 4.0 * (8.0 + stride(fixed)) + 44.0 + 8.0 + 4.0 * fixed);
+        let of_group = n * together * (4.0 * per_light + 32.0 + 20.0);
+        let channels = per_light * together;
+        let region_data = 4.0 * (channels + 2.0) * pixels * filled;
+        let scratch = (THREADS / regions).min(1.0) * n * slots * (80.0 + 4.0 * stride(channels));
+        let parts = [
+            left,
+            ("renderer", n * (80.0 + of(config.visibility.traced, HIERARCHY)) + rows),
+            ("rasteriser", projection + scratch + of_view.max(of_group) + region_data + slot_pool),
+            ("channels of its lights", array(4.0 * channels * pixels) + 4.0 * channels * content),
+            ("its pictures", 12.0 * pixels * pictures + content * 160.0),
+            besides,
+        ];
+        Moment::new(name, &[&common[..], &parts].concat())
+    };
+    let comparison = ("one comparison", (OBSERVATION + COMPARISON) * pixels);
+    if facts.test_images > 0 {
+        all.push(view("evaluation", facts.most_test_lights, pixels, content, comparison));
+    }
+    let control_pixels = pixels.min(384.0 * 384.0);
+    let control_content = content * control_pixels / pixels.max(1.0);
+    // What is black takes nothing: pictures under 24 lights, three of six comparisons, eleven maps.
+    let page = ("page", (24.0 * 3.0 * control_content + (6.0 * 9.0 + 11.0 * 2.0) * content) * PAGE);
+    let besides = (comparison.0, comparison.1 + page.1);
+    let report = view("report", facts.lights.min(24), control_pixels, control_content, page);
+    let shown = view("report", facts.most_test_lights.clamp(1, 6), pixels, content, besides);
+    all.push(if shown.bytes() > report.bytes() { shown } else { report });
+    all
+}
