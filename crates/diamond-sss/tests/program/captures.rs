@@ -60,7 +60,7 @@ pub fn tiny_capture(dir: &Path, views: usize, lights: usize) {
     ball_capture(dir, views, lights, 32, 2);
 }
 
-/// Writes a capture of `views` × `lights` at `side`², and one held-out view under `held_out` lights, the last one unseen.
+/// Writes a capture of `views` × `lights` at `side`², and one held-out view under `held_out` lights, the last one unseen (all beyond `lights` are).
 pub fn ball_capture(dir: &Path, views: usize, lights: usize, side: u32, held_out: usize) {
     let view = |i: usize, lights: &[usize]| ViewDescription {
         camera: camera(i, side),
@@ -75,7 +75,7 @@ pub fn ball_capture(dir: &Path, views: usize, lights: usize, side: u32, held_out
             .collect(),
     };
     let all: Vec<usize> = (0..lights).collect();
-    let shown: Vec<usize> = (0..held_out - 1).chain([lights]).collect();
+    let shown: Vec<usize> = (0..held_out - 1).chain([lights.max(held_out - 1)]).collect();
     let description = CaptureDescription {
         train: (0..views).map(|i| view(i, &all)).collect(),
         test: vec![view(views, &shown)],
