@@ -1,7 +1,7 @@
 //! What is held in each moment of a run, part by part.
 //!
 //! The numbers of bytes per Gaussian, per pixel and per light are sums over the arrays that live then, in the order in
-//! which the code makes them; docs/decisions/0020-memory-limit.md compares the sums with measurements. Where the content
+//! which the code makes them; docs/decisions/0021-memory-limit.md compares the sums with measurements. Where the content
 //! of the photographs decides, which is not known beforehand, a constant below says what is assumed.
 use super::AtOnce;
 use diamond_reconstruct::{
