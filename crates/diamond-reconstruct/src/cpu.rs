@@ -384,7 +384,7 @@ impl Engine for CpuEngine {
             ("visibility look-ups", v.lookups),
             ("visibility traced", v.traced),
             ("visibility kept, nothing moved", v.kept),
-            ("hierarchies built", v.built),
+            ("visibility prepared", v.built),
         ]);
         all
     }

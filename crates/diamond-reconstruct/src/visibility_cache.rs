@@ -6,16 +6,18 @@
 //! old it is. Otherwise the reference moves up to the present and every old light is traced again. Between the trace of
 //! a light and its use lie two such distances at most.
 //!
-//! The hierarchy over the Gaussians is built once for all lights traced in a step. It is not refitted from step to step:
-//! the order in which a ray meets the Gaussians, and with it the last bit of its transmittance, would depend on when
-//! the tree was first built, and an interrupted run could not go on with the same bits.
+//! The Gaussians are prepared once for all lights traced in a step. Where a light lies among them and a hierarchy is
+//! needed, it is not refitted from step to step: the order in which a ray meets the Gaussians, and with it the last bit
+//! of its transmittance, would depend on when the tree was first built, and an interrupted run could not go on with the
+//! same bits.
 use crate::config::Visibility;
 use crate::{ReconstructError, TensorFile, error};
 use diamond_light::OlatLight;
-use diamond_splat::{GaussianBvh, Gaussians, VisibilityConfig};
+use diamond_splat::{GaussianBvh, Gaussians, LightGrid, VisibilityConfig};
 use glam::{Quat, Vec3};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// Bits that identify a light: position or direction. Intensity does not change visibility.
 type LightKey = [u32; 4];
@@ -46,7 +48,7 @@ struct Reference {
 pub struct VisibilityCache {
     entries: BTreeMap<LightKey, Entry>,
     reference: Reference,
-    /// The hierarchy of the step it was built for.
+    /// Prepared for the step.
     tracer: Option<(u64, Tracer)>,
     /// The step whose Gaussians were last compared with the reference.
     compared: Option<u64>,
@@ -56,7 +58,7 @@ pub struct VisibilityCache {
     pub lookups: u64,
     /// Look-ups of old visibility that was kept since nothing had moved.
     pub kept: u64,
-    /// Hierarchies built so far.
+    /// Times that the Gaussians were prepared so far.
     pub built: u64,
 }
 
@@ -74,13 +76,18 @@ fn key(light: &OlatLight) -> LightKey {
     [kind, v.x.to_bits(), v.y.to_bits(), v.z.to_bits()]
 }
 
-/// A hierarchy over the Gaussians as they stand, for any number of lights.
-pub struct Tracer(GaussianBvh);
+/// The Gaussians as they stand, for the visibility of any number of lights: seen from the light where it lies outside of
+/// them, else by rays through a hierarchy that is built when the first such light comes.
+pub struct Tracer {
+    grid: LightGrid,
+    hierarchy: OnceLock<GaussianBvh>,
+}
 
 impl Tracer {
-    /// Builds the hierarchy.
+    /// Prepares the Gaussians.
     pub fn new(gaussians: &Gaussians) -> Result<Self, ReconstructError> {
-        GaussianBvh::build(gaussians).map(Self).map_err(error::stage("visibility"))
+        let grid = LightGrid::new(gaussians).map_err(error::stage("visibility"))?;
+        Ok(Self { grid, hierarchy: OnceLock::new() })
     }
 
     /// Visibility of every Gaussian toward one light.
@@ -90,9 +97,8 @@ impl Tracer {
         normals: &[Vec3],
         light: &OlatLight,
     ) -> Result<Vec<f32>, ReconstructError> {
-        self.0
-            .visibility_to_light(gaussians, Some(normals), light, &VisibilityConfig::default())
-            .map_err(error::stage("visibility"))
+        let all: Vec<u32> = (0..gaussians.len() as u32).collect();
+        self.trace_rows(gaussians, normals, light, &all)
     }
 
     /// Visibility of the Gaussians `rows` toward one light.
@@ -103,9 +109,18 @@ impl Tracer {
         light: &OlatLight,
         rows: &[u32],
     ) -> Result<Vec<f32>, ReconstructError> {
-        self.0
-            .visibility_subset(gaussians, Some(normals), light, &VisibilityConfig::default(), rows)
-            .map_err(error::stage("visibility"))
+        let (config, fail) = (VisibilityConfig::default(), error::stage("visibility"));
+        if let Some(found) = self.grid.visibility(gaussians, Some(normals), light, &config, rows).map_err(&fail)? {
+            return Ok(found);
+        }
+        let hierarchy = match self.hierarchy.get() {
+            Some(hierarchy) => hierarchy,
+            None => {
+                let built = GaussianBvh::build(gaussians).map_err(&fail)?;
+                self.hierarchy.get_or_init(|| built)
+            }
+        };
+        hierarchy.visibility_subset(gaussians, Some(normals), light, &config, rows).map_err(fail)
     }
 }
 

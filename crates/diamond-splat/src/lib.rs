@@ -13,6 +13,7 @@ mod footprint;
 mod gaussians;
 mod hull;
 mod lanes;
+mod light_grid;
 mod neighbours;
 mod ply;
 mod projection;
@@ -29,6 +30,7 @@ pub use error::SplatError;
 pub use factor::LowerFactor;
 pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
 pub use hull::{Hull, HullConfig, scene_bounds_from_masks, visual_hull};
+pub use light_grid::LightGrid;
 pub use neighbours::mean_squared_distance_to_nearest;
 pub use ply::{
     Keep, PlyColumn, PlyElementLayout, PlyFormat, PlyLayout, PlyPropertyLayout, PlyTable, PointCloud, SH_DC,

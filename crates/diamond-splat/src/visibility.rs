@@ -25,7 +25,7 @@ pub const MAX_OCCLUDER_ALPHA: f32 = 0.99;
 /// Opacity at which an occluder ends, as in the rasteriser.
 pub const MIN_OCCLUDER_ALPHA: f32 = 1.0 / 255.0;
 /// Below this transmittance a ray is abandoned.
-const MIN_TRANSMITTANCE: f32 = 1e-4;
+pub(crate) const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// A Gaussian is at least this thick relative to its largest scale: a disc without thickness has no inverse.
 const MIN_FLATNESS: f32 = 1e-6;
 /// A Gaussian is at least this large (scene units), so that its inverse scale squared stays finite.
@@ -50,17 +50,17 @@ impl Default for VisibilityConfig {
 
 /// A Gaussian as rays need it.
 #[derive(Debug, Clone, Copy)]
-struct Occluder {
+pub(crate) struct Occluder {
     /// World → units of the Gaussian's standard deviations, three columns.
     to_local: Mat3,
-    mean: Vec3,
+    pub mean: Vec3,
     opacity: f32,
     /// Squared distance in standard deviations at which opacity falls to [`MIN_OCCLUDER_ALPHA`]; negative if nowhere.
-    max_q: f32,
+    pub max_q: f32,
 }
 
 impl Occluder {
-    fn new(gaussians: &Gaussians, i: usize) -> Self {
+    pub fn new(gaussians: &Gaussians, i: usize) -> Self {
         let (mean, scale, rotation) = (gaussians.means[i], gaussians.scales[i], gaussians.rotations[i]);
         let opacity = gaussians.opacities[i];
         let valid = mean.is_finite() && scale.is_finite() && rotation.is_finite() && opacity >= MIN_OCCLUDER_ALPHA;
@@ -81,22 +81,33 @@ impl Occluder {
 /// The occluders of one leaf, one number after the other, so that eight are tested at once.
 #[derive(Debug, Clone)]
 #[repr(align(64))]
-struct Packet {
+pub(crate) struct Packet {
     /// Column `c`, row `r` of `to_local` at `3·c + r`.
     to_local: [[f32; WIDTH]; 9],
     mean: [[f32; WIDTH]; 3],
-    opacity: [f32; WIDTH],
+    pub opacity: [f32; WIDTH],
     max_q: [f32; WIDTH],
     indices: [u32; WIDTH],
 }
 
 impl Packet {
     fn new(gaussians: &Gaussians, indices: &[u32; WIDTH]) -> Self {
+        Self::filled(indices, |i| Occluder::new(gaussians, i))
+    }
+
+    /// Of occluders that were made before.
+    #[inline(always)]
+    pub fn of(occluders: &[Occluder], indices: &[u32; WIDTH]) -> Self {
+        Self::filled(indices, |i| occluders[i])
+    }
+
+    #[inline(always)]
+    fn filled(indices: &[u32; WIDTH], occluder: impl Fn(usize) -> Occluder) -> Self {
         let zero = [0.0; WIDTH];
         let mut packet =
             Self { to_local: [zero; 9], mean: [zero; 3], opacity: zero, max_q: [-1.0; WIDTH], indices: *indices };
         for lane in (0..WIDTH).filter(|&lane| indices[lane] != NO_BOX) {
-            let occluder = Occluder::new(gaussians, indices[lane] as usize);
+            let occluder = occluder(indices[lane] as usize);
             for (place, value) in packet.to_local.iter_mut().zip(occluder.to_local.to_cols_array()) {
                 place[lane] = value;
             }
@@ -110,7 +121,7 @@ impl Packet {
 
     /// Squared distance of each occluder's peak in its standard deviations, and a bit for each that counts.
     #[inline(always)]
-    fn peaks(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> ([f32; WIDTH], u32) {
+    pub fn peaks(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> ([f32; WIDTH], u32) {
         let m = &self.to_local;
         let mut peaks = [0.0; WIDTH];
         let mut counting = 0u32;
@@ -135,7 +146,7 @@ impl Packet {
     }
 }
 
-fn thickened(scale: Vec3) -> Vec3 {
+pub(crate) fn thickened(scale: Vec3) -> Vec3 {
     scale.abs().max(Vec3::splat((scale.abs().max_element() * MIN_FLATNESS).max(MIN_SCALE)))
 }
 
@@ -310,27 +321,10 @@ impl GaussianBvh {
         config: &VisibilityConfig,
         i: usize,
     ) -> f32 {
-        let mean = gaussians.means[i];
-        let (scale, rotation) = (gaussians.scales[i], unit_rotation(gaussians.rotations[i]));
-        // Standard deviation along a unit direction: |S·Rᵀ·d|.
-        let deviation = |direction: Vec3| (scale * (rotation.conjugate() * direction)).length();
-        let normal = normals.and_then(|normals| normals[i].try_normalize());
-        let origin = match normal {
-            Some(normal) => mean + normal * (config.normal_offset * deviation(normal)),
-            None => mean,
-        };
-        let (direction, distance) = match *light {
-            OlatLight::Point { position, .. } => {
-                let to_light = position - origin;
-                match to_light.try_normalize() {
-                    Some(direction) => (direction, to_light.length()),
-                    None => return 1.0,
-                }
-            }
-            OlatLight::Directional { direction, .. } => (direction, f32::INFINITY),
-        };
-        let begin = if normal.is_some() { 0.0 } else { config.light_offset * deviation(direction) };
-        self.transmittance_without(i as u32, origin, direction, begin, distance)
+        match ray_to_light(gaussians, normals, light, config, i) {
+            Some(ray) => self.transmittance_without(ray.skip, ray.origin, ray.direction, ray.begin, ray.end),
+            None => 1.0,
+        }
     }
 
     fn check_count(&self, found: usize) -> Result<(), SplatError> {
@@ -354,6 +348,48 @@ impl GaussianBvh {
             _ => Ok(()),
         }
     }
+}
+
+/// A ray from a receiver toward a light.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Ray {
+    /// The receiver, which does not shade itself.
+    pub skip: u32,
+    pub origin: Vec3,
+    /// Unit.
+    pub direction: Vec3,
+    /// Occluders count from here, scene units.
+    pub begin: f32,
+    /// Distance to the light, scene units.
+    pub end: f32,
+}
+
+/// The ray from Gaussian `i`: see the head of this file for where it begins. `None` where the light is at its origin.
+pub(crate) fn ray_to_light(
+    gaussians: &Gaussians,
+    normals: Option<&[Vec3]>,
+    light: &OlatLight,
+    config: &VisibilityConfig,
+    i: usize,
+) -> Option<Ray> {
+    let mean = gaussians.means[i];
+    let (scale, rotation) = (gaussians.scales[i], unit_rotation(gaussians.rotations[i]));
+    // Standard deviation along a unit direction: |S·Rᵀ·d|.
+    let deviation = |direction: Vec3| (scale * (rotation.conjugate() * direction)).length();
+    let normal = normals.and_then(|normals| normals[i].try_normalize());
+    let origin = match normal {
+        Some(normal) => mean + normal * (config.normal_offset * deviation(normal)),
+        None => mean,
+    };
+    let (direction, end) = match *light {
+        OlatLight::Point { position, .. } => {
+            let to_light = position - origin;
+            (to_light.try_normalize()?, to_light.length())
+        }
+        OlatLight::Directional { direction, .. } => (direction, f32::INFINITY),
+    };
+    let begin = if normal.is_some() { 0.0 } else { config.light_offset * deviation(direction) };
+    Some(Ray { skip: i as u32, origin, direction, begin, end })
 }
 
 /// A ray on its way through the packets.
@@ -383,7 +419,7 @@ impl Visitor for Pass<'_> {
 
 /// What one occluder takes away, with the fade of [eq:ray-transmittance].
 #[inline]
-fn occluder_alpha(opacity: f32, q: f32) -> f32 {
+pub(crate) fn occluder_alpha(opacity: f32, q: f32) -> f32 {
     let alpha = (opacity * (-0.5 * q).exp()).min(MAX_OCCLUDER_ALPHA);
     alpha * (alpha / MIN_OCCLUDER_ALPHA - 1.0).clamp(0.0, 1.0)
 }
@@ -396,7 +432,7 @@ fn boxes(gaussians: &Gaussians) -> Vec<Aabb> {
     (0..gaussians.len()).into_par_iter().with_min_len(1024).map(|i| bounds(gaussians, i)).collect()
 }
 
-fn check_lengths(gaussians: &Gaussians) -> Result<(), SplatError> {
+pub(crate) fn check_lengths(gaussians: &Gaussians) -> Result<(), SplatError> {
     let n = gaussians.len();
     for (what, found) in [
         ("Gaussians::scales", gaussians.scales.len()),

@@ -1,6 +1,6 @@
 //! Ray-traced visibility: against a brute-force f64 oracle, its laws, and what it does to a sphere of splats.
 use diamond_light::OlatLight;
-use diamond_splat::{GaussianBvh, Gaussians, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};
+use diamond_splat::{GaussianBvh, Gaussians, LightGrid, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};
 use diamond_testkit::visibility as oracle;
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
@@ -133,6 +133,59 @@ proptest! {
 }
 
 /// The comparison above must notice an occluder beyond the light.
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// [eq:ray-transmittance] A light's grid gives what rays through the tree give, for all and for some receivers, with
+    /// and without normals, from lamps and from suns; a cell that lacks an occluder would be noticed.
+    #[test]
+    fn a_grid_of_a_light_equals_the_tree(
+        gaussians in gaussians(1..120), at in vec3(-1.0..1.0), far in 3.0f32..9.0, at_infinity in any::<bool>(),
+        with_normals in any::<bool>(),
+    ) {
+        let direction = at.try_normalize().unwrap_or(Vec3::X);
+        let light = if at_infinity { sun(direction) } else { lamp(far * direction) };
+        let normals: Vec<Vec3> = gaussians.means.iter().map(|m| m.try_normalize().unwrap_or(Vec3::Z)).collect();
+        let normals = with_normals.then_some(normals.as_slice());
+        let all: Vec<u32> = (0..gaussians.len() as u32).collect();
+        let config = VisibilityConfig::default();
+        let expected = GaussianBvh::build(&gaussians).unwrap().visibility_to_light(&gaussians, normals, &light, &config);
+        let grid = LightGrid::new(&gaussians).unwrap();
+        let found = grid.visibility(&gaussians, normals, &light, &config, &all).unwrap();
+        if let Some(found) = &found {
+            for (a, b) in expected.unwrap().iter().zip(found) {
+                prop_assert!((a - b).abs() <= 1.1e-4, "{a} {b}");
+                prop_assert!(a.min(*b) < 1e-4 || (a - b).abs() <= 2e-6, "{a} {b}");
+            }
+            let some: Vec<u32> = all.iter().copied().filter(|i| i % 3 == 1).collect();
+            let few = grid.visibility(&gaussians, normals, &light, &config, &some).unwrap().unwrap();
+            for (&i, v) in some.iter().zip(few) {
+                prop_assert_eq!(v.to_bits(), found[i as usize].to_bits());
+            }
+        }
+        // Gaussians of at most e^-0.5 reach 3.33 deviations: beyond 4 + 2.1 a lamp has them all in front of it.
+        prop_assert!(found.is_some() || (!at_infinity && far < 6.5), "no grid");
+    }
+}
+
+#[test]
+fn a_light_among_the_gaussians_has_no_grid() {
+    let (gaussians, normals) = sphere(300, 1.0, 0.2, 0.9);
+    let grid = LightGrid::new(&gaussians).unwrap();
+    let of = |light: &OlatLight| {
+        grid.visibility(&gaussians, Some(&normals), light, &VisibilityConfig::default(), &[0, 5]).unwrap()
+    };
+    assert!(of(&lamp(Vec3::new(0.2, 0.1, 0.0))).is_none());
+    assert!(of(&lamp(Vec3::new(4.0, 0.1, 0.0))).is_some() && of(&sun(Vec3::X)).is_some());
+    assert!(grid.visibility(&gaussians, None, &sun(Vec3::X), &VisibilityConfig::default(), &[300]).is_err());
+    assert!(
+        grid.visibility(&gaussians, Some(&normals[1..]), &sun(Vec3::X), &VisibilityConfig::default(), &[]).is_err()
+    );
+    let nothing = LightGrid::new(&Gaussians::default()).unwrap();
+    let none = nothing.visibility(&Gaussians::default(), None, &sun(Vec3::X), &VisibilityConfig::default(), &[]);
+    assert_eq!(none.unwrap(), Some(vec![]));
+}
+
 #[test]
 fn the_comparison_notices_a_broken_side() {
     let mut gaussians = Gaussians::default();
@@ -331,7 +384,16 @@ fn timing() {
             let trace = mean(&mut || {
                 bvh.visibility_to_light(&gaussians, Some(&normals), &light, &config).unwrap();
             });
-            println!("{n} splats, flatness {flatness}, opacity {opacity}: build {build:.2} ms, refit {refit:.2}, trace {trace:.2}");
+            let all: Vec<u32> = (0..n as u32).collect();
+            let mut grid = LightGrid::new(&gaussians).unwrap();
+            let prepare = mean(&mut || grid = LightGrid::new(&gaussians).unwrap());
+            let by_grid = mean(&mut || {
+                grid.visibility(&gaussians, Some(&normals), &light, &config, &all).unwrap().unwrap();
+            });
+            println!(
+                "{n} splats, flatness {flatness}, opacity {opacity}: tree {build:.2} ms, refitted {refit:.2}, light \
+                 {trace:.2}; without tree: prepare {prepare:.2}, light {by_grid:.2}"
+            );
         });
     }
 }
