@@ -157,7 +157,7 @@ impl<'m> Renderer<'m> {
         if let Some(tracer) = self.tracer.get() {
             return Ok(tracer);
         }
-        let tracer = Tracer::new(&self.activated.gaussians)?;
+        let tracer = Tracer::new(&self.activated.gaussians, &self.activated.normals)?;
         Ok(self.tracer.get_or_init(|| tracer))
     }
 

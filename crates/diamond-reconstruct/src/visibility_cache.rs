@@ -84,13 +84,13 @@ pub struct Tracer {
 }
 
 impl Tracer {
-    /// Prepares the Gaussians.
-    pub fn new(gaussians: &Gaussians) -> Result<Self, ReconstructError> {
-        let grid = LightGrid::new(gaussians).map_err(error::stage("visibility"))?;
-        Ok(Self { grid, hierarchy: OnceLock::new() })
+    /// Prepares the Gaussians and their outward normals.
+    pub fn new(gaussians: &Gaussians, normals: &[Vec3]) -> Result<Self, ReconstructError> {
+        let grid = LightGrid::new(gaussians, Some(normals), &VisibilityConfig::default());
+        Ok(Self { grid: grid.map_err(error::stage("visibility"))?, hierarchy: OnceLock::new() })
     }
 
-    /// Visibility of every Gaussian toward one light.
+    /// Visibility of every Gaussian toward one light. `gaussians` and `normals` are those that were prepared.
     pub fn trace(
         &self,
         gaussians: &Gaussians,
@@ -109,8 +109,8 @@ impl Tracer {
         light: &OlatLight,
         rows: &[u32],
     ) -> Result<Vec<f32>, ReconstructError> {
-        let (config, fail) = (VisibilityConfig::default(), error::stage("visibility"));
-        if let Some(found) = self.grid.visibility(gaussians, Some(normals), light, &config, rows).map_err(&fail)? {
+        let fail = error::stage("visibility");
+        if let Some(found) = self.grid.visibility(light, rows).map_err(&fail)? {
             return Ok(found);
         }
         let hierarchy = match self.hierarchy.get() {
@@ -120,6 +120,7 @@ impl Tracer {
                 self.hierarchy.get_or_init(|| built)
             }
         };
+        let config = VisibilityConfig::default();
         hierarchy.visibility_subset(gaussians, Some(normals), light, &config, rows).map_err(fail)
     }
 }
@@ -192,7 +193,7 @@ impl VisibilityCache {
             self.traced += 1;
             if self.tracer.as_ref().is_none_or(|(at, _)| *at != step) {
                 self.built += 1;
-                self.tracer = Some((step, Tracer::new(gaussians)?));
+                self.tracer = Some((step, Tracer::new(gaussians, normals)?));
             }
             let values = match &self.tracer {
                 Some((_, tracer)) => tracer.trace(gaussians, normals, light)?,
@@ -306,7 +307,7 @@ mod tests {
         }
         assert_eq!((cache.lookups, cache.traced, cache.built), (50, 1, 1));
         assert_eq!(cache.kept, 40);
-        let anew = Tracer::new(&gaussians).unwrap().trace(&gaussians, &normals, &LIGHT).unwrap();
+        let anew = Tracer::new(&gaussians, &normals).unwrap().trace(&gaussians, &normals, &LIGHT).unwrap();
         assert_eq!(cache.get(&config(), true, &gaussians, &normals, &LIGHT, 99).unwrap(), anew);
         // Without permission to keep it is traced whenever it is old.
         let mut cache = VisibilityCache::default();
@@ -326,7 +327,7 @@ mod tests {
         gaussians.means.iter_mut().for_each(|m| *m += 0.049 * 0.1 * random.direction());
         let kept = cache.get(&config(), true, &gaussians, &normals, &LIGHT, 10).unwrap().to_vec();
         assert_eq!((cache.traced, cache.kept), (1, 1));
-        let anew = Tracer::new(&gaussians).unwrap().trace(&gaussians, &normals, &LIGHT).unwrap();
+        let anew = Tracer::new(&gaussians, &normals).unwrap().trace(&gaussians, &normals, &LIGHT).unwrap();
         let error = kept.iter().zip(&anew).map(|(a, b)| (a - b).abs()).sum::<f32>() / 300.0;
         assert!(error < 0.02, "mean error of kept visibility {error}");
         gaussians.means.iter_mut().take(4).for_each(|m| m.x += 0.02);

@@ -1,42 +1,104 @@
 //! Visibility of one light without a tree: all rays toward a light meet in it, so that in its view each ray is a point.
 //!
-//! Seen from a light (or along its direction, if it is at infinity) a Gaussian covers a small rectangle, and a ray lies
-//! in one cell of a grid. The Gaussians whose rectangles reach into the cell are all that the ray can meet. They are
-//! listed from the light outward, so that a ray is done where the first of them begins behind its receiver. Which
-//! Gaussians count, and by how much, is decided as in [`GaussianBvh`](crate::GaussianBvh): the same numbers in another order of
-//! multiplication. A whole light takes about a fifth of the time that rays through the tree take.
+//! Seen from a light (or along its direction, if it is at infinity) a Gaussian covers a small rectangle, and a ray lies in
+//! one cell of a grid. The Gaussians whose rectangles reach into the cell are all that the ray can meet. They are listed
+//! from the light outward, so that the rays of a cell, a vector of them at a time, are done where the next Gaussian begins
+//! behind them. Which Gaussians count, and by how much, is decided as in [`GaussianBvh`](crate::GaussianBvh), but in the
+//! light's coordinates, where a squared distance from a ray is a quotient of two conics.
 //!
-//! A light must lie outside of the Gaussians, with all of them on one side; where it does not, there is no grid, and
-//! rays through the tree are the answer.
-use crate::bvh::{NO_BOX, WIDTH};
+//! A light must lie outside of the Gaussians, with all of them on one side; where it does not, there is no grid, and rays
+//! through the tree are the answer.
 use crate::density::unit_rotation;
+use crate::recycle::Pool;
 use crate::visibility::{
-    MIN_TRANSMITTANCE, Occluder, Packet, Ray, check_lengths, occluder_alpha, ray_to_light, thickened,
+    MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, MIN_TRANSMITTANCE, Occluder, check_lengths, ray_origin, thickened,
 };
 use crate::{Gaussians, SplatError, VisibilityConfig};
 use diamond_light::OlatLight;
+use diamond_simd::{Lanes, Level, Simd, WithSimd, exp2};
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
 
 /// A point light's Gaussians begin at least at this share of the distance to their middle, in front of it.
 const NEAREST: f32 = 0.05;
-/// Rectangles are widened by this share of the grid against rounding.
+/// Rectangles are widened, and Gaussians taken to begin earlier, by this share of the grid or of the depth: rounding.
 const MARGIN: f32 = 1e-4;
+/// Rays of a cell, about: lists are longer in larger cells, and in smaller ones the vectors are not full.
+const RAYS_PER_CELL: f32 = 8.0;
 /// Cells along a side at most.
-const MAX_CELLS: usize = 96;
-/// Cells per mean rectangle of a Gaussian along a side: finer grids have shorter lists and more of them.
-const CELLS_PER_RECTANGLE: f32 = 2.0;
+const MAX_CELLS: usize = 128;
+/// Half a side of the grid in standard deviations of the Gaussians' places; what lies beyond belongs to the cells at the
+/// edge.
+const GRID_REACH: f32 = 2.5;
+/// Depths that are told apart in the lists.
+const DEPTHS: usize = 1024;
 /// Cells that are one task.
-const CELLS_PER_TASK: usize = 32;
+const CELLS_PER_TASK: usize = 64;
+/// Gaussians that are seen from a light in one task.
+const OCCLUDERS_PER_TASK: usize = 2048;
+/// Indices up to here are `f32`s.
+const MAX_GAUSSIANS: usize = 1 << 24;
+/// Lanes of the widest vector.
+const MAX_LANES: usize = 16;
 
-/// Gaussians as occluders, ready for any number of lights.
+/// Columns of what is known of the occluders.
+mod column {
+    /// Mean, world.
+    pub const MEAN: usize = 0;
+    /// Three semi-axes of the ellipsoid at which an occluder ends, world.
+    pub const AXES: usize = 3;
+    /// World → units of standard deviations, three columns, relative to the largest of its numbers.
+    pub const LOCAL: usize = 12;
+    /// The square of that largest number.
+    pub const SQUARE: usize = 21;
+    pub const COUNT: usize = 22;
+}
+
+/// Gaussians as occluders and receivers, ready for any number of lights.
 #[derive(Debug, Clone)]
 pub struct LightGrid {
-    occluders: Vec<Occluder>,
-    /// Semi-axes of the ellipsoid at which an occluder ends, world.
-    axes: Vec<[Vec3; 3]>,
+    /// Those that occlude anything.
+    occluders: Vec<u32>,
+    /// By [`column`], of the occluders; filled up with the last to whole vectors.
+    columns: [Vec<f32>; column::COUNT],
+    /// Logarithm to base 2 of the opacity, and squared reach in standard deviations, of the occluders.
+    opacity: Vec<[f32; 2]>,
+    receivers: Vec<Receiver>,
+    /// Where rays without a normal begin, standard deviations.
+    light_offset: f32,
     middle: Vec3,
 }
+
+/// Where a Gaussian's rays toward lights begin.
+#[derive(Debug, Clone, Copy)]
+struct Receiver {
+    origin: Vec3,
+    /// Scaled axes, for Gaussians without a normal.
+    free: Option<Mat3>,
+}
+
+/// An occluder in a light's view. Places are (x, y) on its plane, and `e` is a ray's place less the occluder's.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(16))]
+struct Seen {
+    at: [f32; 2],
+    /// Squared distance times `1 + …`: coefficients of e_x², e_x·e_y, e_y².
+    distance: [f32; 3],
+    /// Of e_x, e_y, e_x², e_x·e_y, e_y² in what the squared distance is divided by, besides 1.
+    divisor: [f32; 5],
+    /// Depth of the peak times the divisor: 1, e_x, e_y.
+    peak: [f32; 3],
+    log2_opacity: f32,
+    /// Squared reach, standard deviations.
+    max_q: f32,
+    index: f32,
+    /// Where it begins.
+    begin: f32,
+    low: [f32; 2],
+    high: [f32; 2],
+}
+
+static SEEN: Pool<Seen> = Pool::new();
 
 /// A light's view: points to its plane.
 struct Plane {
@@ -48,12 +110,12 @@ struct Plane {
     nearest: f32,
 }
 
-/// A rectangle on the plane and where along the view it begins.
-#[derive(Clone, Copy)]
-struct Rectangle {
-    low: [f32; 2],
-    high: [f32; 2],
-    begin: f32,
+/// A ray toward the light.
+#[derive(Debug, Clone, Copy)]
+struct Ray {
+    at: [f32; 2],
+    /// Occluders count up to this depth.
+    end: f32,
 }
 
 impl Plane {
@@ -69,33 +131,174 @@ impl Plane {
         Some(Self { light: position, u, v, w, nearest })
     }
 
-    /// In the light's axes, and the plane's coordinates.
-    fn place(&self, point: Vec3) -> ([f32; 2], f32) {
-        let p = point - self.light.unwrap_or(Vec3::ZERO);
+    /// `None` where the ray does not begin in front of the light.
+    fn ray(&self, receiver: &Receiver, light_offset: f32) -> Option<Ray> {
+        let p = receiver.origin - self.light.unwrap_or(Vec3::ZERO);
         let (x, y, z) = (p.dot(self.u), p.dot(self.v), p.dot(self.w));
-        if self.light.is_some() { ([x / z, y / z], z) } else { ([x, y], z) }
+        let length = if self.light.is_some() { p.length() } else { 1.0 };
+        // Depth per unit of the way toward the light.
+        let slope = if self.light.is_some() { z / length } else { 1.0 };
+        let begin = receiver.free.map_or(0.0, |axes| {
+            let direction = if self.light.is_some() { p / length } else { self.w };
+            light_offset * (axes.transpose() * direction).length()
+        });
+        let at = if self.light.is_some() { [x / z, y / z] } else { [x, y] };
+        let ray = Ray { at, end: z - begin * slope };
+        (z >= self.nearest && at[0].is_finite() && at[1].is_finite() && ray.end.is_finite()).then_some(ray)
     }
+}
 
-    /// What the ellipsoid of semi-axes `axes` about `centre` covers; `None` if part of it is too near to the light.
-    fn rectangle(&self, centre: Vec3, axes: &[Vec3; 3]) -> Option<Rectangle> {
-        let half = |d: Vec3| Vec3::new(axes[0].dot(d), axes[1].dot(d), axes[2].dot(d)).length();
-        let p = centre - self.light.unwrap_or(Vec3::ZERO);
-        let (z, depth) = (p.dot(self.w), half(self.w));
-        let begin = z - depth;
-        let near_enough = begin >= self.nearest && (z + depth).is_finite();
-        let side = |d: Vec3| {
-            let (x, half) = (p.dot(d), half(d));
-            match self.light {
-                Some(_) => {
-                    let (low, high) = (x - half, x + half);
-                    ((low / begin).min(low / (z + depth)), (high / begin).max(high / (z + depth)))
-                }
-                None => (x - half, x + half),
+/// Sees the occluders `first..first + to.len()` from a light; whether all of them are in front of it and finite.
+struct See<'a> {
+    grid: &'a LightGrid,
+    plane: &'a Plane,
+    first: usize,
+    to: &'a mut [Seen],
+}
+
+impl WithSimd for See<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> bool {
+        let Self { grid, plane, first, to } = self;
+        let (u, v, w) = (vector(s, plane.u), vector(s, plane.v), vector(s, plane.w));
+        let light = vector(s, plane.light.unwrap_or(Vec3::ZERO));
+        let one = Lanes::splat(s, 1.0);
+        let mut fine = true;
+        for (block, to) in to.chunks_mut(S::F32_LANES).enumerate() {
+            let i = first + block * S::F32_LANES;
+            let at = triple(s, grid, column::MEAN, i);
+            let p = [at[0] - light[0], at[1] - light[1], at[2] - light[2]];
+            let (x, y, z) = (dot(&p, &u), dot(&p, &v), dot(&p, &w));
+            let axes = [
+                triple(s, grid, column::AXES, i),
+                triple(s, grid, column::AXES + 3, i),
+                triple(s, grid, column::AXES + 6, i),
+            ];
+            let (half_x, half_y, half_z) = (half(&axes, &u), half(&axes, &v), half(&axes, &w));
+            let local = [
+                triple(s, grid, column::LOCAL, i),
+                triple(s, grid, column::LOCAL + 3, i),
+                triple(s, grid, column::LOCAL + 6, i),
+            ];
+            let (a, b) = (apply(&local, &u), apply(&local, &v));
+            let square = Lanes::load(s, &grid.columns[column::SQUARE][i..]);
+            let (near, far) = (z - half_z, z + half_z);
+            let (x_low, x_high, y_low, y_high) = (x - half_x, x + half_x, y - half_y, y + half_y);
+            let lamp = plane.light.is_some();
+            let inverse_z = if lamp { one / z } else { one };
+            let (low, high) = if lamp {
+                let (near, far) = (one / near, one / far);
+                (
+                    [(x_low * near).min(x_low * far), (y_low * near).min(y_low * far)],
+                    [(x_high * near).max(x_high * far), (y_high * near).max(y_high * far)],
+                )
+            } else {
+                ([x_low, y_low], [x_high, y_high])
+            };
+            // Along the ray through the mean, and what changes beside it.
+            let along = if lamp { apply(&local, &p) } else { apply(&local, &w) };
+            let d = [along[0] * inverse_z, along[1] * inverse_z, along[2] * inverse_z];
+            let inverse = one / dot(&d, &d);
+            let (g_x, g_y) = (dot(&d, &a) * inverse, dot(&d, &b) * inverse);
+            let (across_x, across_y) = (cross(&d, &a), cross(&d, &b));
+            let scale = if lamp { z * z * square * inverse } else { square * inverse };
+            let distance = [
+                scale * dot(&across_x, &across_x),
+                scale * dot(&across_x, &across_y) * 2.0,
+                scale * dot(&across_y, &across_y),
+            ];
+            let zero = one - one;
+            let (divisor, peak) = if lamp {
+                let h = [dot(&a, &a) * inverse, dot(&a, &b) * inverse * 2.0, dot(&b, &b) * inverse];
+                ([g_x * 2.0, g_y * 2.0, h[0], h[1], h[2]], [z, z * g_x, z * g_y])
+            } else {
+                ([zero; 5], [z, -g_x, -g_y])
+            };
+            let numbers = [
+                x * inverse_z,
+                y * inverse_z,
+                distance[0],
+                distance[1],
+                distance[2],
+                divisor[0],
+                divisor[1],
+                divisor[2],
+                divisor[3],
+                divisor[4],
+                peak[0],
+                peak[1],
+                peak[2],
+                near,
+                low[0],
+                low[1],
+                high[0],
+                high[1],
+            ];
+            let mut stored = [[0.0f32; MAX_LANES]; 18];
+            for (stored, number) in stored.iter_mut().zip(&numbers) {
+                number.store(stored);
             }
-        };
-        let (x, y) = (side(self.u), side(self.v));
-        near_enough.then_some(Rectangle { low: [x.0, y.0], high: [x.1, y.1], begin })
+            for (lane, to) in to.iter_mut().enumerate() {
+                let n = |k: usize| stored[k][lane];
+                let [log2_opacity, max_q] = grid.opacity[i + lane];
+                *to = Seen {
+                    at: [n(0), n(1)],
+                    distance: [n(2), n(3), n(4)],
+                    divisor: [n(5), n(6), n(7), n(8), n(9)],
+                    peak: [n(10), n(11), n(12)],
+                    log2_opacity,
+                    max_q,
+                    index: grid.occluders[i + lane] as f32,
+                    begin: n(13),
+                    low: [n(14), n(15)],
+                    high: [n(16), n(17)],
+                };
+                let sum: f32 = (0..stored.len()).map(|k| stored[k][lane].abs()).sum();
+                fine &= to.begin >= plane.nearest && sum.is_finite();
+            }
+        }
+        fine
     }
+}
+
+#[inline(always)]
+fn vector<S: Simd>(s: S, v: Vec3) -> [Lanes<S>; 3] {
+    [Lanes::splat(s, v.x), Lanes::splat(s, v.y), Lanes::splat(s, v.z)]
+}
+
+#[inline(always)]
+fn triple<S: Simd>(s: S, grid: &LightGrid, column: usize, i: usize) -> [Lanes<S>; 3] {
+    let c = &grid.columns;
+    [Lanes::load(s, &c[column][i..]), Lanes::load(s, &c[column + 1][i..]), Lanes::load(s, &c[column + 2][i..])]
+}
+
+#[inline(always)]
+fn dot<S: Simd>(a: &[Lanes<S>; 3], b: &[Lanes<S>; 3]) -> Lanes<S> {
+    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
+}
+
+#[inline(always)]
+fn cross<S: Simd>(a: &[Lanes<S>; 3], b: &[Lanes<S>; 3]) -> [Lanes<S>; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Half of what an ellipsoid with these semi-axes covers along a direction.
+#[inline(always)]
+fn half<S: Simd>(axes: &[[Lanes<S>; 3]; 3], direction: &[Lanes<S>; 3]) -> Lanes<S> {
+    let along = [dot(&axes[0], direction), dot(&axes[1], direction), dot(&axes[2], direction)];
+    dot(&along, &along).sqrt()
+}
+
+/// A matrix of three columns times a vector.
+#[inline(always)]
+fn apply<S: Simd>(m: &[[Lanes<S>; 3]; 3], x: &[Lanes<S>; 3]) -> [Lanes<S>; 3] {
+    [
+        m[0][0].mul_add(x[0], m[1][0].mul_add(x[1], m[2][0] * x[2])),
+        m[0][1].mul_add(x[0], m[1][1].mul_add(x[1], m[2][1] * x[2])),
+        m[0][2].mul_add(x[0], m[1][2].mul_add(x[1], m[2][2] * x[2])),
+    ]
 }
 
 /// Items listed by cell, in the order in which they were given.
@@ -105,15 +308,15 @@ struct Cells {
 }
 
 impl Cells {
-    /// `each` calls its argument with every (item, cell).
+    /// `each` calls its argument with every (item, cell), twice in the same order.
     fn new(count: usize, each: impl Fn(&mut dyn FnMut(u32, usize))) -> Self {
-        let mut starts = vec![0u32; count + 1];
-        each(&mut |_, cell| starts[cell + 1] += 1);
+        let mut next = vec![0u32; count + 1];
+        each(&mut |_, cell| next[cell + 1] += 1);
         for cell in 0..count {
-            starts[cell + 1] += starts[cell];
+            next[cell + 1] += next[cell];
         }
+        let starts = next.clone();
         let mut items = vec![0; starts[count] as usize];
-        let mut next = starts.clone();
         each(&mut |item, cell| {
             items[next[cell] as usize] = item;
             next[cell] += 1;
@@ -126,232 +329,280 @@ impl Cells {
     }
 }
 
-/// A regular grid on the plane.
+/// A regular grid on the plane, and the depths that are told apart.
 struct Grid {
     low: [f32; 2],
     /// Cells per unit.
     scale: [f32; 2],
-    size: [usize; 2],
+    /// Cells along a side.
+    side: usize,
+    nearest: f32,
+    /// Depths per unit.
+    depths: f32,
 }
 
 impl Grid {
-    /// Over the `points` of rays, with cells that fit the `rectangles`.
-    fn new(points: &[[f32; 2]], rectangles: &[Option<Rectangle>]) -> Self {
-        let mut grid = Self { low: [0.0; 2], scale: [0.0; 2], size: [1; 2] };
+    /// Fits the occluders, so that it does not depend on who asks.
+    fn new(seen: &[Seen], receivers: usize) -> Self {
+        let side = (receivers as f32 / RAYS_PER_CELL).sqrt() as usize;
+        let n = seen.len().max(1) as f32;
+        let (mut low, mut scale) = ([0.0; 2], [0.0; 2]);
+        let side = side.clamp(1, MAX_CELLS);
         for k in 0..2 {
-            let low = points.iter().map(|p| p[k]).fold(f32::INFINITY, f32::min);
-            let high = points.iter().map(|p| p[k]).fold(f32::NEG_INFINITY, f32::max);
-            let range = high - low;
-            let (sum, n) = rectangles.iter().flatten().fold((0.0, 0), |(s, n), r| (s + (r.high[k] - r.low[k]), n + 1));
-            let cells = CELLS_PER_RECTANGLE * range / (sum / n.max(1) as f32);
-            // The comparison is false for NaN and where there is nothing to divide.
-            if range > 0.0 && cells > 1.0 {
-                grid.size[k] = (cells as usize).clamp(1, MAX_CELLS);
-                grid.scale[k] = grid.size[k] as f32 / range;
+            let mean = seen.iter().map(|s| s.at[k]).sum::<f32>() / n;
+            let variance = seen.iter().map(|s| (s.at[k] - mean) * (s.at[k] - mean)).sum::<f32>() / n;
+            let reach = GRID_REACH * variance.sqrt();
+            let begin = seen.iter().map(|s| s.low[k]).fold(f32::INFINITY, f32::min).max(mean - reach);
+            let end = seen.iter().map(|s| s.high[k]).fold(f32::NEG_INFINITY, f32::max).min(mean + reach);
+            let cells = side as f32 / (end - begin);
+            // Else everything is in one line of cells.
+            if end > begin && cells.is_finite() {
+                (low[k], scale[k]) = (begin, cells);
             }
-            grid.low[k] = if low.is_finite() { low } else { 0.0 };
         }
-        grid
+        let nearest = seen.iter().map(|s| s.begin).fold(f32::INFINITY, f32::min);
+        let farthest = seen.iter().map(|s| s.begin).fold(f32::NEG_INFINITY, f32::max);
+        let depths = (DEPTHS - 1) as f32 / (farthest - nearest);
+        let depths = if depths.is_finite() { depths } else { 0.0 };
+        Self { low, scale, side, nearest, depths }
     }
 
     fn line(&self, k: usize, value: f32) -> usize {
         // `as` saturates: below is 0, beyond is the last.
-        (((value - self.low[k]) * self.scale[k]) as usize).min(self.size[k] - 1)
+        (((value - self.low[k]) * self.scale[k]) as usize).min(self.side - 1)
     }
 
-    fn cell(&self, p: [f32; 2]) -> usize {
-        self.line(1, p[1]) * self.size[0] + self.line(0, p[0])
+    fn cell(&self, at: [f32; 2]) -> usize {
+        self.line(1, at[1]) * self.side + self.line(0, at[0])
     }
 
-    /// Calls `f` with every cell that `r` reaches into.
-    fn covered(&self, r: &Rectangle, f: &mut dyn FnMut(usize)) {
-        let lines = |k: usize| {
-            let margin = MARGIN * self.size[k] as f32 / self.scale[k].max(f32::MIN_POSITIVE);
-            let margin = if self.scale[k] > 0.0 { margin } else { 0.0 };
-            let end = self.low[k] + self.size[k] as f32 / self.scale[k].max(f32::MIN_POSITIVE) + margin;
-            let outside = self.scale[k] > 0.0 && (r.high[k] + margin < self.low[k] || r.low[k] - margin > end);
-            (!outside).then(|| self.line(k, r.low[k] - margin)..=self.line(k, r.high[k] + margin))
-        };
-        if let (Some(columns), Some(rows)) = (lines(0), lines(1)) {
-            for y in rows {
-                columns.clone().for_each(|x| f(y * self.size[0] + x));
-            }
-        }
+    /// First and last cell along a side.
+    fn lines(&self, k: usize, seen: &Seen) -> (usize, usize) {
+        let margin = if self.scale[k] > 0.0 { MARGIN * self.side as f32 / self.scale[k] } else { 0.0 };
+        (self.line(k, seen.low[k] - margin), self.line(k, seen.high[k] + margin))
+    }
+
+    fn depth(&self, z: f32) -> usize {
+        (((z - self.nearest) * self.depths) as usize).min(DEPTHS - 1)
+    }
+
+    /// Nothing later in a list begins before this.
+    fn begin_of_rest(&self, begin: f32) -> f32 {
+        let depth = if self.depths > 0.0 { 1.0 / self.depths } else { 0.0 };
+        begin - depth - MARGIN * begin.abs()
     }
 }
 
 impl LightGrid {
-    /// Prepares the Gaussians. Errors only where the arrays differ in length; Gaussians that are not finite never occlude.
-    pub fn new(gaussians: &Gaussians) -> Result<Self, SplatError> {
+    /// Prepares the Gaussians, with outward `normals` if any (one per Gaussian; those of zero length count as absent).
+    ///
+    /// # Errors
+    /// Arrays that differ in length. Gaussians that are not finite never occlude.
+    pub fn new(gaussians: &Gaussians, normals: Option<&[Vec3]>, config: &VisibilityConfig) -> Result<Self, SplatError> {
         check_lengths(gaussians)?;
         let n = gaussians.len();
-        let occluders: Vec<Occluder> = (0..n).map(|i| Occluder::new(gaussians, i)).collect();
-        let axes = (0..n).map(|i| {
-            let reach = occluders[i].max_q.max(0.0).sqrt();
-            if reach == 0.0 {
-                return [Vec3::ZERO; 3];
+        if let Some(normals) = normals.filter(|normals| normals.len() != n) {
+            return Err(SplatError::Shape {
+                what: "LightGrid, normals",
+                expected: format!("{n} (one per Gaussian)"),
+                found: normals.len().to_string(),
+            });
+        }
+        let mut columns: [Vec<f32>; column::COUNT] = Default::default();
+        let (mut occluders, mut opacity) = (Vec::new(), Vec::new());
+        let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for i in 0..n {
+            let o = Occluder::new(gaussians, i);
+            if o.max_q < 0.0 {
+                continue;
             }
+            (low, high) = (low.min(o.mean), high.max(o.mean));
+            occluders.push(i as u32);
+            opacity.push([o.opacity.log2(), o.max_q]);
             let rotation = Mat3::from_quat(unit_rotation(gaussians.rotations[i]));
-            let s = thickened(gaussians.scales[i]) * reach;
-            [rotation.x_axis * s.x, rotation.y_axis * s.y, rotation.z_axis * s.z]
-        });
-        let axes = axes.collect();
-        let valid = || occluders.iter().filter(|o| o.max_q >= 0.0);
-        let low = valid().map(|o| o.mean).fold(Vec3::INFINITY, Vec3::min);
-        let high = valid().map(|o| o.mean).fold(Vec3::NEG_INFINITY, Vec3::max);
+            let axes = rotation * Mat3::from_diagonal(thickened(gaussians.scales[i]) * o.max_q.sqrt());
+            let local = o.to_local.to_cols_array();
+            let largest = local.iter().fold(f32::MIN_POSITIVE, |m, v| m.max(v.abs()));
+            let numbers = o.mean.to_array().into_iter().chain(axes.to_cols_array());
+            let numbers = numbers.chain(local.map(|v| v / largest)).chain([largest * largest]);
+            columns.iter_mut().zip(numbers).for_each(|(column, v)| column.push(v));
+        }
+        for column in &mut columns {
+            let last = column.last().copied().unwrap_or(0.0);
+            column.resize(column.len() + MAX_LANES, last);
+        }
         let middle = 0.5 * low + 0.5 * high;
-        let middle = if middle.is_finite() { middle } else { Vec3::ZERO };
-        Ok(Self { occluders, axes, middle })
+        let receivers = (0..n).map(|i| {
+            let (origin, has_normal) = ray_origin(gaussians, normals, config, i);
+            let axes =
+                || Mat3::from_quat(unit_rotation(gaussians.rotations[i])) * Mat3::from_diagonal(gaussians.scales[i]);
+            Receiver { origin, free: (!has_normal).then(axes) }
+        });
+        Ok(Self {
+            receivers: receivers.collect(),
+            occluders,
+            columns,
+            opacity,
+            light_offset: config.light_offset,
+            middle: if middle.is_finite() { middle } else { Vec3::ZERO },
+        })
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.receivers.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.receivers.is_empty()
     }
 
     /// What [`GaussianBvh::visibility_subset`](crate::GaussianBvh::visibility_subset) gives for the Gaussians `receivers`,
     /// in their order, to rounding and to the transmittance of 1e-4 below which neither looks further. A receiver's bits
     /// depend neither on the other receivers nor on the number of threads. `None` where the light lies among or too near
-    /// to the Gaussians.
+    /// to the Gaussians, or a Gaussian is too large or too small for the light's coordinates.
     /// `[eq:ray-transmittance]`
     ///
     /// # Errors
-    /// Other Gaussians than those it was made of; normals of another number; receivers beyond the last Gaussian.
-    pub fn visibility(
-        &self,
-        gaussians: &Gaussians,
-        normals: Option<&[Vec3]>,
-        light: &OlatLight,
-        config: &VisibilityConfig,
-        receivers: &[u32],
-    ) -> Result<Option<Vec<f32>>, SplatError> {
-        self.check(gaussians, normals, receivers)?;
+    /// Receivers beyond the last Gaussian.
+    pub fn visibility(&self, light: &OlatLight, receivers: &[u32]) -> Result<Option<Vec<f32>>, SplatError> {
+        if let Some(bad) = receivers.iter().find(|&&i| i as usize >= self.len()) {
+            return Err(SplatError::Shape {
+                what: "LightGrid, receivers",
+                expected: format!("indices below {}", self.len()),
+                found: bad.to_string(),
+            });
+        }
+        if self.len() > MAX_GAUSSIANS {
+            return Ok(None);
+        }
         let Some(plane) = Plane::new(light, self.middle) else { return Ok(None) };
-        let rectangles: Vec<Option<Rectangle>> = (0..self.occluders.len())
-            .into_par_iter()
-            .with_min_len(1024)
-            .map(|i| {
-                let o = &self.occluders[i];
-                (o.max_q >= 0.0).then(|| plane.rectangle(o.mean, &self.axes[i]))
-            })
-            .map(|r| match r {
-                Some(None) => Err(()),
-                Some(r) => Ok(r),
-                None => Ok(None),
-            })
-            .collect::<Result<_, ()>>()
-            .unwrap_or_default();
-        if rectangles.len() != self.occluders.len() {
-            return Ok(None);
-        }
-        let rays: Vec<Option<(Ray, [f32; 2], f32)>> = receivers
-            .par_iter()
-            .with_min_len(512)
-            .map(|&i| {
-                let ray = ray_to_light(gaussians, normals, light, config, i as usize)?;
-                let (p, z) = plane.place(ray.origin);
-                (p[0].is_finite() && p[1].is_finite() && z.is_finite()).then_some((ray, p, z))
-            })
-            .collect();
-        if rays.iter().flatten().any(|(.., z)| *z < plane.nearest) {
-            return Ok(None);
-        }
-        let mut order: Vec<(f32, u32)> =
-            rectangles.iter().enumerate().filter_map(|(i, r)| r.map(|r| (r.begin, i as u32))).collect();
-        order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let points: Vec<[f32; 2]> = rays.iter().flatten().map(|(_, p, _)| *p).collect();
-        let grid = Grid::new(&points, &rectangles);
-        let count = grid.size[0] * grid.size[1];
+        // Asked here: the setting belongs to the thread that called.
+        let level = Level::current();
+        let mut seen = SEEN.take();
+        seen.resize(self.occluders.len(), Seen::default());
+        let fine = seen
+            .par_chunks_mut(OCCLUDERS_PER_TASK)
+            .enumerate()
+            .map(|(task, to)| level.dispatch(See { grid: self, plane: &plane, first: task * OCCLUDERS_PER_TASK, to }));
+        let visibility = if fine.reduce(|| true, |a, b| a & b) {
+            let rays = receivers.iter().map(|&i| plane.ray(&self.receivers[i as usize], self.light_offset));
+            let rays: Option<Vec<Ray>> = rays.collect();
+            rays.map(|rays| self.trace(level, &seen, &rays, receivers))
+        } else {
+            None
+        };
+        SEEN.give(seen);
+        Ok(visibility)
+    }
+
+    fn trace(&self, level: Level, seen: &[Seen], rays: &[Ray], receivers: &[u32]) -> Vec<f32> {
+        let grid = Grid::new(seen, self.len());
+        let count = grid.side * grid.side;
+        let by_depth = Cells::new(DEPTHS, |put| {
+            seen.iter().enumerate().for_each(|(i, s)| put(i as u32, grid.depth(s.begin)));
+        });
         let lists = Cells::new(count, |put| {
-            for (rank, (_, i)) in order.iter().enumerate() {
-                if let Some(r) = &rectangles[*i as usize] {
-                    grid.covered(r, &mut |cell| put(rank as u32, cell));
+            for &i in &by_depth.items {
+                let s = &seen[i as usize];
+                let ((left, right), (top, bottom)) = (grid.lines(0, s), grid.lines(1, s));
+                for y in top..=bottom {
+                    (left..=right).for_each(|x| put(i, y * grid.side + x));
                 }
             }
+        });
+        let by_depth = Cells::new(DEPTHS, |put| {
+            rays.iter().enumerate().for_each(|(k, ray)| put(k as u32, grid.depth(ray.end)));
         });
         let members = Cells::new(count, |put| {
-            for (k, ray) in rays.iter().enumerate() {
-                if let Some((_, p, _)) = ray {
-                    put(k as u32, grid.cell(*p));
-                }
-            }
+            by_depth.items.iter().for_each(|&k| put(k, grid.cell(rays[k as usize].at)));
         });
-        // Asked here: the setting belongs to the thread that called.
-        let level = diamond_simd::Level::current();
         let traced: Vec<Vec<f32>> = (0..count.div_ceil(CELLS_PER_TASK))
             .into_par_iter()
             .map(|task| {
                 let cells = task * CELLS_PER_TASK..count.min((task + 1) * CELLS_PER_TASK);
-                let task = Task { grid: self, order: &order, lists: &lists, members: &members, rays: &rays, cells };
-                level.dispatch(task)
+                level.dispatch(Trace { grid: &grid, seen, lists: &lists, members: &members, rays, receivers, cells })
             })
             .collect();
-        let mut out = vec![1.0; receivers.len()];
+        let mut out = vec![1.0; rays.len()];
         for (&k, v) in members.items.iter().zip(traced.iter().flatten()) {
             out[k as usize] = *v;
         }
-        Ok(Some(out))
-    }
-
-    fn check(&self, gaussians: &Gaussians, normals: Option<&[Vec3]>, receivers: &[u32]) -> Result<(), SplatError> {
-        check_lengths(gaussians)?;
-        let n = self.occluders.len();
-        let fail = |what, expected: String, found: String| Err(SplatError::Shape { what, expected, found });
-        if gaussians.len() != n {
-            return fail("LightGrid", format!("{n} (as when it was made)"), gaussians.len().to_string());
-        }
-        if let Some(normals) = normals.filter(|normals| normals.len() != n) {
-            return fail("LightGrid, normals", format!("{n} (one per Gaussian)"), normals.len().to_string());
-        }
-        match receivers.iter().find(|&&i| i as usize >= n) {
-            Some(bad) => fail("LightGrid, receivers", format!("indices below {n}"), bad.to_string()),
-            None => Ok(()),
-        }
+        out
     }
 }
 
 /// The rays of some cells, in the order of the cells' members.
-struct Task<'a> {
-    grid: &'a LightGrid,
-    order: &'a [(f32, u32)],
+struct Trace<'a> {
+    grid: &'a Grid,
+    seen: &'a [Seen],
     lists: &'a Cells,
     members: &'a Cells,
-    rays: &'a [Option<(Ray, [f32; 2], f32)>],
+    rays: &'a [Ray],
+    receivers: &'a [u32],
     cells: std::ops::Range<usize>,
 }
 
-impl diamond_simd::WithSimd for Task<'_> {
+impl WithSimd for Trace<'_> {
     type Output = Vec<f32>;
 
     #[inline(always)]
-    fn with_simd<S: diamond_simd::Simd>(self, _: S) -> Vec<f32> {
-        let mut out = Vec::new();
-        let mut packets: Vec<Packet> = Vec::new();
+    fn with_simd<S: Simd>(self, s: S) -> Vec<f32> {
+        let members = self.members.starts[self.cells.start]..self.members.starts[self.cells.end];
+        let mut out = Vec::with_capacity(members.len());
         for cell in self.cells.clone() {
             let list = self.lists.of(cell);
-            packets.clear();
-            for &k in self.members.of(cell) {
-                let Some((ray, _, z)) = &self.rays[k as usize] else { continue };
-                // Nothing that begins behind the receiver lies between it and the light.
-                let behind = z + MARGIN * z.abs();
-                let mut transmittance = 1.0f32;
-                'list: for (at, ranks) in list.chunks(WIDTH).enumerate() {
-                    if self.order[ranks[0] as usize].0 > behind {
+            for rays in self.members.of(cell).chunks(S::F32_LANES) {
+                let mut numbers = [[0.0f32; MAX_LANES]; 4];
+                let mut farthest = f32::NEG_INFINITY;
+                for (lane, &k) in rays.iter().enumerate() {
+                    let ray = &self.rays[k as usize];
+                    farthest = farthest.max(ray.end);
+                    numbers[0][lane] = ray.at[0];
+                    numbers[1][lane] = ray.at[1];
+                    numbers[2][lane] = ray.end;
+                    numbers[3][lane] = self.receivers[k as usize] as f32;
+                }
+                // Lanes without a ray: nothing lies in front of them.
+                numbers[2][rays.len()..].fill(f32::NEG_INFINITY);
+                let [x, y, end, receiver] = &numbers;
+                let (x, y) = (Lanes::load(s, x), Lanes::load(s, y));
+                let (end, receiver) = (Lanes::load(s, end), Lanes::load(s, receiver));
+                let mut transmittance = Lanes::splat(s, 1.0);
+                let half = Lanes::splat(s, 0.5);
+                let least = Lanes::splat(s, MIN_TRANSMITTANCE);
+                for &i in list {
+                    let o = &self.seen[i as usize];
+                    if self.grid.begin_of_rest(o.begin) > farthest {
                         break;
                     }
-                    if at == packets.len() {
-                        let mut indices = [NO_BOX; WIDTH];
-                        indices.iter_mut().zip(ranks).for_each(|(i, &rank)| *i = self.order[rank as usize].1);
-                        packets.push(Packet::of(&self.grid.occluders, &indices));
+                    let (e_x, e_y) = (x - o.at[0], y - o.at[1]);
+                    let [xx, xy, yy] = o.distance;
+                    let q = (e_x * xx).mul_add(e_x, (e_x * xy + e_y * yy) * e_y);
+                    let [d_x, d_y, d_xx, d_xy, d_yy] = o.divisor;
+                    let divisor = (e_x * d_xx + d_x).mul_add(e_x, (e_x * d_xy + (e_y * d_yy + d_y)) * e_y) + 1.0;
+                    let peak = e_x * o.peak[1] + (e_y * o.peak[2] + o.peak[0]);
+                    // Comparisons are false for NaN, which thus never occludes. Who lets nothing through stays as it is.
+                    let counts = q.lt(divisor * o.max_q)
+                        & peak.lt(end * divisor)
+                        & (receiver - o.index).abs().gt(half)
+                        & transmittance.ge(least);
+                    if !counts.any() {
+                        continue;
                     }
-                    let packet = &packets[at];
-                    let (peaks, mut counting) = packet.peaks(ray.skip, ray.origin, ray.direction, ray.begin, ray.end);
-                    while counting != 0 {
-                        let lane = counting.trailing_zeros() as usize;
-                        counting &= counting - 1;
-                        transmittance *= 1.0 - occluder_alpha(packet.opacity[lane], peaks[lane]);
-                        // After each, so that the result does not depend on how the list is cut into packets.
-                        if transmittance < MIN_TRANSMITTANCE {
-                            break 'list;
-                        }
+                    let q = (q / divisor).max(q.same(0.0));
+                    let alpha = exp2(q * (-0.5 * std::f32::consts::LOG2_E) + o.log2_opacity);
+                    let alpha = alpha.min(alpha.same(MAX_OCCLUDER_ALPHA));
+                    let alpha = alpha * (alpha * (1.0 / MIN_OCCLUDER_ALPHA) - 1.0).clamp(0.0, 1.0);
+                    transmittance = counts.select(transmittance - transmittance * alpha, transmittance);
+                    if !transmittance.ge(least).any() {
+                        break;
                     }
                 }
-                out.push(transmittance);
+                let mut stored = [0.0; MAX_LANES];
+                transmittance.store(&mut stored);
+                out.extend_from_slice(&stored[..rays.len()]);
             }
         }
         out

@@ -52,9 +52,9 @@ impl Default for VisibilityConfig {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Occluder {
     /// World → units of the Gaussian's standard deviations, three columns.
-    to_local: Mat3,
+    pub to_local: Mat3,
     pub mean: Vec3,
-    opacity: f32,
+    pub opacity: f32,
     /// Squared distance in standard deviations at which opacity falls to [`MIN_OCCLUDER_ALPHA`]; negative if nowhere.
     pub max_q: f32,
 }
@@ -81,33 +81,22 @@ impl Occluder {
 /// The occluders of one leaf, one number after the other, so that eight are tested at once.
 #[derive(Debug, Clone)]
 #[repr(align(64))]
-pub(crate) struct Packet {
+struct Packet {
     /// Column `c`, row `r` of `to_local` at `3·c + r`.
     to_local: [[f32; WIDTH]; 9],
     mean: [[f32; WIDTH]; 3],
-    pub opacity: [f32; WIDTH],
+    opacity: [f32; WIDTH],
     max_q: [f32; WIDTH],
     indices: [u32; WIDTH],
 }
 
 impl Packet {
     fn new(gaussians: &Gaussians, indices: &[u32; WIDTH]) -> Self {
-        Self::filled(indices, |i| Occluder::new(gaussians, i))
-    }
-
-    /// Of occluders that were made before.
-    #[inline(always)]
-    pub fn of(occluders: &[Occluder], indices: &[u32; WIDTH]) -> Self {
-        Self::filled(indices, |i| occluders[i])
-    }
-
-    #[inline(always)]
-    fn filled(indices: &[u32; WIDTH], occluder: impl Fn(usize) -> Occluder) -> Self {
         let zero = [0.0; WIDTH];
         let mut packet =
             Self { to_local: [zero; 9], mean: [zero; 3], opacity: zero, max_q: [-1.0; WIDTH], indices: *indices };
         for lane in (0..WIDTH).filter(|&lane| indices[lane] != NO_BOX) {
-            let occluder = occluder(indices[lane] as usize);
+            let occluder = Occluder::new(gaussians, indices[lane] as usize);
             for (place, value) in packet.to_local.iter_mut().zip(occluder.to_local.to_cols_array()) {
                 place[lane] = value;
             }
@@ -121,7 +110,7 @@ impl Packet {
 
     /// Squared distance of each occluder's peak in its standard deviations, and a bit for each that counts.
     #[inline(always)]
-    pub fn peaks(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> ([f32; WIDTH], u32) {
+    fn peaks(&self, skip: u32, origin: Vec3, direction: Vec3, t_min: f32, t_max: f32) -> ([f32; WIDTH], u32) {
         let m = &self.to_local;
         let mut peaks = [0.0; WIDTH];
         let mut counting = 0u32;
@@ -352,35 +341,46 @@ impl GaussianBvh {
 
 /// A ray from a receiver toward a light.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Ray {
+struct Ray {
     /// The receiver, which does not shade itself.
-    pub skip: u32,
-    pub origin: Vec3,
+    skip: u32,
+    origin: Vec3,
     /// Unit.
-    pub direction: Vec3,
+    direction: Vec3,
     /// Occluders count from here, scene units.
-    pub begin: f32,
+    begin: f32,
     /// Distance to the light, scene units.
-    pub end: f32,
+    end: f32,
+}
+
+/// Where the rays of Gaussian `i` begin, and whether it has a normal: see the head of this file.
+pub(crate) fn ray_origin(
+    gaussians: &Gaussians,
+    normals: Option<&[Vec3]>,
+    config: &VisibilityConfig,
+    i: usize,
+) -> (Vec3, bool) {
+    let mean = gaussians.means[i];
+    match normals.and_then(|normals| normals[i].try_normalize()) {
+        Some(normal) => (mean + normal * (config.normal_offset * deviation(gaussians, i, normal)), true),
+        None => (mean, false),
+    }
+}
+
+/// Standard deviation of Gaussian `i` along a unit direction: |S·Rᵀ·d|.
+fn deviation(gaussians: &Gaussians, i: usize, direction: Vec3) -> f32 {
+    (gaussians.scales[i] * (unit_rotation(gaussians.rotations[i]).conjugate() * direction)).length()
 }
 
 /// The ray from Gaussian `i`: see the head of this file for where it begins. `None` where the light is at its origin.
-pub(crate) fn ray_to_light(
+fn ray_to_light(
     gaussians: &Gaussians,
     normals: Option<&[Vec3]>,
     light: &OlatLight,
     config: &VisibilityConfig,
     i: usize,
 ) -> Option<Ray> {
-    let mean = gaussians.means[i];
-    let (scale, rotation) = (gaussians.scales[i], unit_rotation(gaussians.rotations[i]));
-    // Standard deviation along a unit direction: |S·Rᵀ·d|.
-    let deviation = |direction: Vec3| (scale * (rotation.conjugate() * direction)).length();
-    let normal = normals.and_then(|normals| normals[i].try_normalize());
-    let origin = match normal {
-        Some(normal) => mean + normal * (config.normal_offset * deviation(normal)),
-        None => mean,
-    };
+    let (origin, has_normal) = ray_origin(gaussians, normals, config, i);
     let (direction, end) = match *light {
         OlatLight::Point { position, .. } => {
             let to_light = position - origin;
@@ -388,7 +388,7 @@ pub(crate) fn ray_to_light(
         }
         OlatLight::Directional { direction, .. } => (direction, f32::INFINITY),
     };
-    let begin = if normal.is_some() { 0.0 } else { config.light_offset * deviation(direction) };
+    let begin = if has_normal { 0.0 } else { config.light_offset * deviation(gaussians, i, direction) };
     Some(Ray { skip: i as u32, origin, direction, begin, end })
 }
 
@@ -419,7 +419,7 @@ impl Visitor for Pass<'_> {
 
 /// What one occluder takes away, with the fade of [eq:ray-transmittance].
 #[inline]
-pub(crate) fn occluder_alpha(opacity: f32, q: f32) -> f32 {
+fn occluder_alpha(opacity: f32, q: f32) -> f32 {
     let alpha = (opacity * (-0.5 * q).exp()).min(MAX_OCCLUDER_ALPHA);
     alpha * (alpha / MIN_OCCLUDER_ALPHA - 1.0).clamp(0.0, 1.0)
 }

