@@ -23,8 +23,9 @@ use rayon::prelude::*;
 const NEAREST: f32 = 0.05;
 /// Rectangles are widened, and Gaussians taken to begin earlier, by this share of the grid or of the depth: rounding.
 const MARGIN: f32 = 1e-4;
-/// Rays of a cell, about: lists are longer in larger cells, and in smaller ones the vectors are not full.
-const RAYS_PER_CELL: f32 = 8.0;
+/// Rays of a cell, about: lists are longer in larger cells; in smaller ones the rays of a vector begin at very different
+/// depths.
+const RAYS_PER_CELL: f32 = 32.0;
 /// Cells along a side at most.
 const MAX_CELLS: usize = 128;
 /// Half a side of the grid in standard deviations of the Gaussians' places; what lies beyond belongs to the cells at the
@@ -36,6 +37,8 @@ const DEPTHS: usize = 1024;
 const CELLS_PER_TASK: usize = 64;
 /// Gaussians that are seen from a light in one task.
 const OCCLUDERS_PER_TASK: usize = 2048;
+/// Occluders of a list that go through the stages of a ray together.
+const CHUNK: usize = 64;
 /// Indices up to here are `f32`s.
 const MAX_GAUSSIANS: usize = 1 << 24;
 /// Lanes of the widest vector.
@@ -376,9 +379,13 @@ impl Grid {
         self.line(1, at[1]) * self.side + self.line(0, at[0])
     }
 
+    fn margin(&self, k: usize) -> f32 {
+        if self.scale[k] > 0.0 { MARGIN * self.side as f32 / self.scale[k] } else { 0.0 }
+    }
+
     /// First and last cell along a side.
     fn lines(&self, k: usize, seen: &Seen) -> (usize, usize) {
-        let margin = if self.scale[k] > 0.0 { MARGIN * self.side as f32 / self.scale[k] } else { 0.0 };
+        let margin = self.margin(k);
         (self.line(k, seen.low[k] - margin), self.line(k, seen.high[k] + margin))
     }
 
@@ -489,7 +496,7 @@ impl LightGrid {
         let visibility = if fine.reduce(|| true, |a, b| a & b) {
             let rays = receivers.iter().map(|&i| plane.ray(&self.receivers[i as usize], self.light_offset));
             let rays: Option<Vec<Ray>> = rays.collect();
-            rays.map(|rays| self.trace(level, &seen, &rays, receivers))
+            rays.map(|rays| self.trace(level, &mut seen, &rays, receivers))
         } else {
             None
         };
@@ -497,7 +504,7 @@ impl LightGrid {
         Ok(visibility)
     }
 
-    fn trace(&self, level: Level, seen: &[Seen], rays: &[Ray], receivers: &[u32]) -> Vec<f32> {
+    fn trace(&self, level: Level, seen: &mut [Seen], rays: &[Ray], receivers: &[u32]) -> Vec<f32> {
         let grid = Grid::new(seen, self.len());
         let count = grid.side * grid.side;
         let by_depth = Cells::new(DEPTHS, |put| {
@@ -512,13 +519,15 @@ impl LightGrid {
                 }
             }
         });
+        seen.iter_mut().for_each(|s| s.begin = grid.begin_of_rest(s.begin));
+        let seen = &*seen;
         let by_depth = Cells::new(DEPTHS, |put| {
             rays.iter().enumerate().for_each(|(k, ray)| put(k as u32, grid.depth(ray.end)));
         });
         let members = Cells::new(count, |put| {
             by_depth.items.iter().for_each(|&k| put(k, grid.cell(rays[k as usize].at)));
         });
-        let traced: Vec<Vec<f32>> = (0..count.div_ceil(CELLS_PER_TASK))
+        let traced: Vec<Vec<(u32, f32)>> = (0..count.div_ceil(CELLS_PER_TASK))
             .into_par_iter()
             .map(|task| {
                 let cells = task * CELLS_PER_TASK..count.min((task + 1) * CELLS_PER_TASK);
@@ -526,8 +535,8 @@ impl LightGrid {
             })
             .collect();
         let mut out = vec![1.0; rays.len()];
-        for (&k, v) in members.items.iter().zip(traced.iter().flatten()) {
-            out[k as usize] = *v;
+        for &(k, v) in traced.iter().flatten() {
+            out[k as usize] = v;
         }
         out
     }
@@ -545,24 +554,35 @@ struct Trace<'a> {
 }
 
 impl WithSimd for Trace<'_> {
-    type Output = Vec<f32>;
+    type Output = Vec<(u32, f32)>;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> Vec<f32> {
+    fn with_simd<S: Simd>(self, s: S) -> Vec<(u32, f32)> {
         let members = self.members.starts[self.cells.start]..self.members.starts[self.cells.end];
         let mut out = Vec::with_capacity(members.len());
+        let mut candidates = [0u32; CHUNK];
+        let mut quotients = [[[0.0f32; MAX_LANES]; 2]; CHUNK];
+        let mut opacities = [0.0f32; CHUNK];
         for cell in self.cells.clone() {
             let list = self.lists.of(cell);
             for rays in self.members.of(cell).chunks(S::F32_LANES) {
                 let mut numbers = [[0.0f32; MAX_LANES]; 4];
                 let mut farthest = f32::NEG_INFINITY;
+                let (mut low, mut high) = ([f32::INFINITY; 2], [f32::NEG_INFINITY; 2]);
                 for (lane, &k) in rays.iter().enumerate() {
                     let ray = &self.rays[k as usize];
                     farthest = farthest.max(ray.end);
+                    for k in 0..2 {
+                        (low[k], high[k]) = (low[k].min(ray.at[k]), high[k].max(ray.at[k]));
+                    }
                     numbers[0][lane] = ray.at[0];
                     numbers[1][lane] = ray.at[1];
                     numbers[2][lane] = ray.end;
                     numbers[3][lane] = self.receivers[k as usize] as f32;
+                }
+                for k in 0..2 {
+                    let margin = self.grid.margin(k);
+                    (low[k], high[k]) = (low[k] - margin, high[k] + margin);
                 }
                 // Lanes without a ray: nothing lies in front of them.
                 numbers[2][rays.len()..].fill(f32::NEG_INFINITY);
@@ -572,37 +592,57 @@ impl WithSimd for Trace<'_> {
                 let mut transmittance = Lanes::splat(s, 1.0);
                 let half = Lanes::splat(s, 0.5);
                 let least = Lanes::splat(s, MIN_TRANSMITTANCE);
-                for &i in list {
-                    let o = &self.seen[i as usize];
-                    if self.grid.begin_of_rest(o.begin) > farthest {
+                let (nothing, one) = (Lanes::splat(s, f32::MAX), Lanes::splat(s, 1.0));
+                // Each stage appends to what the next reads, without a branch that depends on the data.
+                for list in list.chunks(CHUNK) {
+                    if self.seen[list[0] as usize].begin > farthest {
                         break;
                     }
-                    let (e_x, e_y) = (x - o.at[0], y - o.at[1]);
-                    let [xx, xy, yy] = o.distance;
-                    let q = (e_x * xx).mul_add(e_x, (e_x * xy + e_y * yy) * e_y);
-                    let [d_x, d_y, d_xx, d_xy, d_yy] = o.divisor;
-                    let divisor = (e_x * d_xx + d_x).mul_add(e_x, (e_x * d_xy + (e_y * d_yy + d_y)) * e_y) + 1.0;
-                    let peak = e_x * o.peak[1] + (e_y * o.peak[2] + o.peak[0]);
-                    // Comparisons are false for NaN, which thus never occludes. Who lets nothing through stays as it is.
-                    let counts = q.lt(divisor * o.max_q)
-                        & peak.lt(end * divisor)
-                        & (receiver - o.index).abs().gt(half)
-                        & transmittance.ge(least);
-                    if !counts.any() {
-                        continue;
+                    let mut near = 0;
+                    for &i in list {
+                        let o = &self.seen[i as usize];
+                        let beside = (o.low[0] > high[0])
+                            | (o.high[0] < low[0])
+                            | (o.low[1] > high[1])
+                            | (o.high[1] < low[1])
+                            | (o.begin > farthest);
+                        candidates[near] = i;
+                        near += usize::from(!beside);
                     }
-                    let q = (q / divisor).max(q.same(0.0));
-                    let alpha = exp2(q * (-0.5 * std::f32::consts::LOG2_E) + o.log2_opacity);
-                    let alpha = alpha.min(alpha.same(MAX_OCCLUDER_ALPHA));
-                    let alpha = alpha * (alpha * (1.0 / MIN_OCCLUDER_ALPHA) - 1.0).clamp(0.0, 1.0);
-                    transmittance = counts.select(transmittance - transmittance * alpha, transmittance);
+                    let mut met = 0;
+                    for &i in &candidates[..near] {
+                        let o = &self.seen[i as usize];
+                        let (e_x, e_y) = (x - o.at[0], y - o.at[1]);
+                        let [xx, xy, yy] = o.distance;
+                        let q = (e_x * xx).mul_add(e_x, (e_x * xy + e_y * yy) * e_y);
+                        let [d_x, d_y, d_xx, d_xy, d_yy] = o.divisor;
+                        let divisor = (e_x * d_xx + d_x).mul_add(e_x, (e_x * d_xy + (e_y * d_yy + d_y)) * e_y) + 1.0;
+                        let peak = e_x * o.peak[1] + (e_y * o.peak[2] + o.peak[0]);
+                        // Comparisons are false for NaN, which thus never occludes.
+                        let counts = q.lt(divisor * o.max_q)
+                            & peak.lt(end * divisor)
+                            & (receiver - o.index).abs().gt(half);
+                        counts.select(q, nothing).store(&mut quotients[met][0]);
+                        counts.select(divisor, one).store(&mut quotients[met][1]);
+                        opacities[met] = o.log2_opacity;
+                        met += usize::from(counts.any());
+                    }
+                    for (quotient, log2_opacity) in quotients[..met].iter().zip(&opacities) {
+                        let q = (Lanes::load(s, &quotient[0]) / Lanes::load(s, &quotient[1])).max(one - one);
+                        let alpha = exp2(q * (-0.5 * std::f32::consts::LOG2_E) + *log2_opacity);
+                        let alpha = alpha.min(alpha.same(MAX_OCCLUDER_ALPHA));
+                        let alpha = alpha * (alpha * (1.0 / MIN_OCCLUDER_ALPHA) - 1.0).clamp(0.0, 1.0);
+                        // Who lets nothing through stays as it is.
+                        let open = transmittance.ge(least);
+                        transmittance = open.select(transmittance.neg_mul_add(alpha, transmittance), transmittance);
+                    }
                     if !transmittance.ge(least).any() {
                         break;
                     }
                 }
                 let mut stored = [0.0; MAX_LANES];
                 transmittance.store(&mut stored);
-                out.extend_from_slice(&stored[..rays.len()]);
+                out.extend(rays.iter().copied().zip(stored));
             }
         }
         out
