@@ -619,9 +619,8 @@ impl WithSimd for Trace<'_> {
                         let divisor = (e_x * d_xx + d_x).mul_add(e_x, (e_x * d_xy + (e_y * d_yy + d_y)) * e_y) + 1.0;
                         let peak = e_x * o.peak[1] + (e_y * o.peak[2] + o.peak[0]);
                         // Comparisons are false for NaN, which thus never occludes.
-                        let counts = q.lt(divisor * o.max_q)
-                            & peak.lt(end * divisor)
-                            & (receiver - o.index).abs().gt(half);
+                        let counts =
+                            q.lt(divisor * o.max_q) & peak.lt(end * divisor) & (receiver - o.index).abs().gt(half);
                         counts.select(q, nothing).store(&mut quotients[met][0]);
                         counts.select(divisor, one).store(&mut quotients[met][1]);
                         opacities[met] = o.log2_opacity;
