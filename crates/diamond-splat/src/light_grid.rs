@@ -212,7 +212,7 @@ impl WithSimd for See<'_> {
                 scale * dot(&across_x, &across_y) * 2.0,
                 scale * dot(&across_y, &across_y),
             ];
-            let zero = one - one;
+            let zero = Lanes::splat(s, 0.0);
             let (divisor, peak) = if lamp {
                 let h = [dot(&a, &a) * inverse, dot(&a, &b) * inverse * 2.0, dot(&b, &b) * inverse];
                 ([g_x * 2.0, g_y * 2.0, h[0], h[1], h[2]], [z, z * g_x, z * g_y])
@@ -592,7 +592,7 @@ impl WithSimd for Trace<'_> {
                 let mut transmittance = Lanes::splat(s, 1.0);
                 let half = Lanes::splat(s, 0.5);
                 let least = Lanes::splat(s, MIN_TRANSMITTANCE);
-                let (nothing, one) = (Lanes::splat(s, f32::MAX), Lanes::splat(s, 1.0));
+                let (nothing, one, zero) = (Lanes::splat(s, f32::MAX), Lanes::splat(s, 1.0), Lanes::splat(s, 0.0));
                 // Each stage appends to what the next reads, without a branch that depends on the data.
                 for list in list.chunks(CHUNK) {
                     if self.seen[list[0] as usize].begin > farthest {
@@ -627,7 +627,7 @@ impl WithSimd for Trace<'_> {
                         met += usize::from(counts.any());
                     }
                     for (quotient, log2_opacity) in quotients[..met].iter().zip(&opacities) {
-                        let q = (Lanes::load(s, &quotient[0]) / Lanes::load(s, &quotient[1])).max(one - one);
+                        let q = (Lanes::load(s, &quotient[0]) / Lanes::load(s, &quotient[1])).max(zero);
                         let alpha = exp2(q * (-0.5 * std::f32::consts::LOG2_E) + *log2_opacity);
                         let alpha = alpha.min(alpha.same(MAX_OCCLUDER_ALPHA));
                         let alpha = alpha * (alpha * (1.0 / MIN_OCCLUDER_ALPHA) - 1.0).clamp(0.0, 1.0);
