@@ -31,8 +31,8 @@ const REGION: [f64; 2] = [64.0, 32.0];
 const THREADS: f64 = 8.0;
 /// Block lists of the rasteriser, per pixel of the content.
 const LISTS: f64 = 12.0;
-/// The hierarchy over the Gaussians for rays: packets and nodes.
-const HIERARCHY: f64 = 110.0;
+/// The Gaussians prepared for visibility, and as two lights at once see them.
+const LIGHT_GRID: f64 = 330.0;
 /// The objective's pictures, per pixel of the content: encoded pictures, windows, their cotangents.
 const OBJECTIVE: f64 = 100.0;
 /// Both pictures, SSIM and FLIP (in double precision) of one comparison, per pixel.
@@ -149,7 +149,7 @@ pub fn moments(
     };
     let parameters = ("Gaussians: values and two moments", n * (12.0 * values + 12.0) + gains);
     let kept_lights = facts.lights.min(VISIBILITY_LIGHTS) as f64;
-    let visibility = ("visibility", of(traced, n * (4.0 * kept_lights + 44.0 + HIERARCHY)));
+    let visibility = ("visibility", of(traced, n * (4.0 * kept_lights + 44.0 + LIGHT_GRID)));
     let kept = at_once.buffers as f64;
 
     // A step: where the rasteriser runs backward, and where the residual does.
@@ -211,7 +211,7 @@ pub fn moments(
         let scratch = (THREADS / regions).min(1.0) * n * slots * (80.0 + 4.0 * stride(channels));
         let parts = [
             left,
-            ("renderer", n * (80.0 + of(config.visibility.traced, HIERARCHY)) + rows),
+            ("renderer", n * (80.0 + of(config.visibility.traced, LIGHT_GRID)) + rows),
             ("its pictures", 12.0 * pixels * pictures),
             ("page", page),
         ];
