@@ -77,12 +77,8 @@ pub fn write_capture(
     whole_or_absent(dir, description, |folder| write_into(folder, description, &mut pixels))
 }
 
-/// Lets `write` fill a hidden folder beside `dir`, and renames it to `dir` when all of it is on disk.
-pub(crate) fn whole_or_absent(
-    dir: &Path,
-    description: &CaptureDescription,
-    write: impl FnOnce(&Path) -> Result<(), DatasetError>,
-) -> Result<(), DatasetError> {
+/// The name of a capture that does not exist yet and has an image.
+pub(crate) fn check_new(dir: &Path, description: &CaptureDescription) -> Result<String, DatasetError> {
     let refuse = |reason: &str| DatasetError::Write { path: dir.to_path_buf(), reason: reason.to_string() };
     if dir.symlink_metadata().is_ok() {
         return Err(refuse("the folder exists already; choose another, or remove it"));
@@ -91,9 +87,19 @@ pub(crate) fn whole_or_absent(
     if description.train.iter().all(|view| view.shots.is_empty()) {
         return Err(refuse("there is no training image; describe at least one"));
     }
+    Ok(name.to_string_lossy().into_owned())
+}
+
+/// Lets `write` fill a hidden folder beside `dir`, and renames it to `dir` when all of it is on disk.
+pub(crate) fn whole_or_absent(
+    dir: &Path,
+    description: &CaptureDescription,
+    write: impl FnOnce(&Path) -> Result<(), DatasetError>,
+) -> Result<(), DatasetError> {
+    let name = check_new(dir, description)?;
     let parent = dir.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(parent).map_err(|e| DatasetError::io(parent, "create the folder", e))?;
-    let temporary = parent.join(format!(".{}.partial-{}", name.to_string_lossy(), std::process::id()));
+    let temporary = parent.join(format!(".{name}.partial-{}", std::process::id()));
     let cleared = match std::fs::remove_dir_all(&temporary) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(DatasetError::io(&temporary, "clear the folder", e)),
         _ => Ok(()),
@@ -115,32 +121,51 @@ fn write_into(
     pixels: &mut impl FnMut(Split, usize, usize) -> Result<Pixels, DatasetError>,
 ) -> Result<(), DatasetError> {
     create_folder(dir)?;
-    for (split, folder, views) in
-        [(Split::Train, "train", &description.train), (Split::Test, "test", &description.test)]
-    {
-        if views.is_empty() {
-            continue;
-        }
+    for (split, folder, views) in splits(description) {
         create_folder(&dir.join(folder))?;
-        let mut names = BTreeSet::new();
-        let mut frames = Vec::new();
+        // A name that cannot be used is found before any image is asked for.
+        frames(dir, folder, views)?;
         for (v, view) in views.iter().enumerate() {
-            frames.push(frame_json(dir, folder, view, &mut names)?);
             for (s, shot) in view.shots.iter().enumerate() {
-                let path = dir.join(folder).join(format!("{}.png", shot.name));
+                let path = image_path(dir, folder, shot);
                 let bytes =
                     encode(&path, &view.camera, &pixels(split, v, s)?, description.transfer, description.depth)?;
                 write_synced(&path, &bytes)?;
             }
         }
+    }
+    write_transforms(dir, description)?;
+    write_points(dir, description)?;
+    sync_folder(dir)
+}
+
+/// The splits that have views, with the names of their folders.
+pub(crate) fn splits(description: &CaptureDescription) -> impl Iterator<Item = (Split, &str, &[ViewDescription])> {
+    let all = [(Split::Train, "train", &description.train), (Split::Test, "test", &description.test)];
+    all.into_iter().filter(|(.., views)| !views.is_empty()).map(|(split, folder, views)| (split, folder, &views[..]))
+}
+
+/// Where an image of a split's folder is written.
+pub(crate) fn image_path(dir: &Path, folder: &str, shot: &ShotDescription) -> PathBuf {
+    dir.join(folder).join(format!("{}.png", shot.name))
+}
+
+/// The frames of a split, as `transforms_*.json` has them.
+pub(crate) fn frames(dir: &Path, folder: &str, views: &[ViewDescription]) -> Result<Vec<Value>, DatasetError> {
+    let mut names = BTreeSet::new();
+    views.iter().map(|view| frame_json(dir, folder, view, &mut names)).collect()
+}
+
+/// Writes `transforms_*.json`, after the images that it names.
+pub(crate) fn write_transforms(dir: &Path, description: &CaptureDescription) -> Result<(), DatasetError> {
+    for (_, folder, views) in splits(description) {
         let camera = &views[0].camera.intrinsics;
         let fov_x = 2.0 * (0.5 * f64::from(camera.width) / f64::from(camera.fx)).atan();
-        let json = json!({ "camera_angle_x": fov_x, "frames": frames });
+        let json = json!({ "camera_angle_x": fov_x, "frames": frames(dir, folder, views)? });
         write_synced(&dir.join(format!("transforms_{folder}.json")), format!("{json:#}\n").as_bytes())?;
         sync_folder(&dir.join(folder))?;
     }
-    write_points(dir, description)?;
-    sync_folder(dir)
+    Ok(())
 }
 
 pub(crate) fn create_folder(path: &Path) -> Result<(), DatasetError> {
