@@ -1,7 +1,10 @@
 //! True geometry of rendered captures, for evaluation only: no reconstruction may look at it.
 use crate::{DatasetError, Place, View};
 use diamond_image::Image;
-use exr::prelude::{FlatSamples, MetaData, read_first_flat_layer_from_file};
+use exr::prelude::{
+    AnyChannel, AnyChannels, Encoding, FlatSamples, Layer, LayerAttributes, MetaData, WritableImage,
+    read_first_flat_layer_from_file,
+};
 
 /// Depth and normal of what each pixel sees.
 #[derive(Debug, Clone, PartialEq)]
@@ -10,6 +13,47 @@ pub struct Geometry {
     pub depth: Image,
     /// World normal, three channels; 0 where nothing is hit.
     pub normal: Image,
+}
+
+impl Geometry {
+    /// As an EXR file that [`View::ground_truth_geometry`] reads: the same bytes for the same geometry.
+    ///
+    /// # Errors
+    /// Depth and normals that are not of one size, with one and three channels.
+    pub fn encode(&self) -> Result<Vec<u8>, DatasetError> {
+        let (width, height, _) = self.depth.shape();
+        let sizes = self.depth.expect_shape((width, height, 1), "depth");
+        sizes.and_then(|()| self.normal.expect_shape((width, height, 3), "normals")).map_err(|e| {
+            DatasetError::Write { path: "geometry".into(), reason: e.to_string() }
+        })?;
+        let normal = |c: usize| self.normal.data().iter().skip(c).step_by(3).copied().collect();
+        let channels = [
+            ("depth.z", self.depth.data().to_vec()),
+            ("normal.x", normal(0)),
+            ("normal.y", normal(1)),
+            ("normal.z", normal(2)),
+        ];
+        encode_exr(width, height, channels)
+    }
+}
+
+/// Channels of 32-bit floats, `width · height` numbers each, as an EXR file without loss: the same bytes for the same numbers.
+///
+/// # Errors
+/// Numbers that the encoder refuses.
+pub fn encode_exr<const N: usize>(
+    width: usize,
+    height: usize,
+    channels: [(&str, Vec<f32>); N],
+) -> Result<Vec<u8>, DatasetError> {
+    let list = channels.into_iter().map(|(name, values)| AnyChannel::new(name, FlatSamples::F32(values)));
+    let channels = AnyChannels::sort(list.collect());
+    let layer = Layer::new((width, height), LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
+    let mut out = std::io::Cursor::new(Vec::new());
+    // On one thread: in parallel, chunks are written in the order in which they are done.
+    let written = exr::prelude::Image::from_layer(layer).write().non_parallel().to_buffered(&mut out);
+    written.map_err(|e| DatasetError::Write { path: "EXR".into(), reason: format!("cannot be encoded: {e}") })?;
+    Ok(out.into_inner())
 }
 
 const ADVICE: &str =

@@ -56,7 +56,7 @@ pub use develop::Undistortion;
 pub use error::{DatasetError, Place};
 pub use format::CaptureFormat;
 pub use frames::{Entry, Frame, Frames, parse_transforms};
-pub use geometry::Geometry;
+pub use geometry::{Geometry, encode_exr};
 pub use hash::FileDigest;
 pub use in_progress::CaptureInProgress;
 pub use lens::Lens;

@@ -5,12 +5,14 @@
 //! A [`Recipe`] names an object, its material, a rig of cameras and lights, and how much is computed. [`Plan`] lists the
 //! images that follow, [`Object`] is the closed shape. A [`Family`] draws hundreds of recipes
 //! from one seed.
+mod capture;
 mod error;
 mod family;
 mod object;
 mod plan;
 mod recipe;
 
+pub use capture::{CaptureRecord, Progress, Stage, synthesize};
 pub use error::SynthError;
 pub use family::Family;
 pub use object::Object;

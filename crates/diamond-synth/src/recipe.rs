@@ -320,15 +320,23 @@ impl Default for FilmRecipe {
 }
 
 /// How much is computed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct QualityRecipe {
-    /// Rays per pixel; by default the renderer's.
-    pub samples: Option<u32>,
+    /// Rays per pixel are the square of this; by default the renderer's.
+    pub samples_per_axis: Option<u32>,
     /// Points at which transport is solved.
     pub points: Option<u32>,
     /// Walks from each point.
     pub walks: Option<u32>,
+    /// Whether errors are measured against the reference and written into `capture.json`.
+    pub measure: bool,
+}
+
+impl Default for QualityRecipe {
+    fn default() -> Self {
+        Self { samples_per_axis: None, points: None, walks: None, measure: true }
+    }
 }
 
 fn rotation(degrees: [f32; 3]) -> Quat {

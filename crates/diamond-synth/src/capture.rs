@@ -1,0 +1,311 @@
+//! From a recipe to a capture: transport is solved once per group of views, images are written as they come, and what
+//! the error is, is measured and written beside them.
+//!
+//! Whoever is interrupted goes on: images that are there are not rendered again, and the bytes are the same in the end.
+//! Held-out images come from a solution with random numbers of its own, so that what training images have in common with
+//! each other they do not have in common with them.
+use crate::object::points_ply;
+use crate::{Object, Plan, PlannedView, Recipe, SynthError};
+use diamond_camera::Camera;
+use diamond_dataset::{
+    BitDepth, CaptureDescription, CaptureInProgress, DatasetError, Geometry, Provenance, ShotDescription, Split,
+    ViewDescription, encode_exr,
+};
+use diamond_image::{Mask, Transfer};
+use diamond_light::{Falloff, OlatLight};
+use diamond_pathtrace::{
+    Bulk, BulkError, BulkOptions, BulkView, Light, ReferenceOptions, RepairReport, Scene, measure_bulk,
+};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// Lights that share a solution at most: bounds its memory.
+const LIGHTS_PER_SOLUTION: usize = 128;
+/// Seeds of held-out images, of the measurement, of the exposure and of points are the recipe's with these bits turned.
+const HELD_OUT: u64 = 0x7465_7374;
+const MEASURED: u64 = 0x6572_726f_72;
+const EXPOSED: u64 = 0x6578_706f;
+/// Points and walks of the solution that finds the exposure.
+const EXPOSURE_EFFORT: (u32, u32) = (1000, 64);
+/// Views and largest side of its pictures, and of those that are compared with the reference.
+const EXPOSURE_VIEWS: usize = 4;
+const EXPOSURE_SIDE: u32 = 48;
+/// So many of the covered values are above [`BRIGHT`] after exposure.
+const BRIGHT_SHARE: f64 = 0.01;
+const BRIGHT: f32 = 0.9;
+/// Lights and views of the comparison with the reference, the side of its pictures, and paths per pixel.
+const MEASURED_LIGHTS: usize = 4;
+const MEASURED_VIEWS: usize = 2;
+const MEASURED_SIDE: u32 = 32;
+const MEASURED_PATHS: u32 = 512;
+
+/// What is being done, for progress bars.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Stage {
+    /// Finding the exposure.
+    Exposure,
+    /// Solving transport: group of views, and how many there are.
+    Solve(usize, usize),
+    /// Rendering and writing images: done, and how many there are.
+    Images(usize, usize),
+    /// Comparing with the reference.
+    Measure,
+}
+
+/// What was made.
+#[derive(Debug, Clone)]
+pub struct CaptureRecord {
+    /// SHA-256 of the recipe.
+    pub recipe_hash: String,
+    /// Radiance was multiplied by this.
+    pub exposure: f32,
+    /// Which form of solution was chosen, and why.
+    pub form: &'static str,
+    /// Repairs of the mesh.
+    pub repairs: RepairReport,
+    /// Errors against the reference, if they were measured.
+    pub error: Option<BulkError>,
+    /// Images in the capture.
+    pub images: usize,
+    /// Of those, rendered by this call; the others were there.
+    pub rendered: usize,
+}
+
+/// Progress: a stage and the fraction of it that is done.
+pub type Progress<'a> = dyn Fn(Stage, f32) + Sync + 'a;
+
+struct Job<'a> {
+    recipe: &'a Recipe,
+    plan: Plan,
+    object: Object,
+    progress: &'a Progress<'a>,
+}
+
+/// Makes the capture `dir`, which must not exist; `folder` is where the recipe's paths are relative to.
+///
+/// # Errors
+/// Recipes, meshes and folders that cannot be used. What is done so far stays beside `dir` for the next call.
+pub fn synthesize(
+    recipe: &Recipe,
+    folder: &Path,
+    dir: &Path,
+    progress: &Progress<'_>,
+) -> Result<CaptureRecord, SynthError> {
+    let plan = Plan::new(recipe)?;
+    let object = Object::new(recipe, folder)?;
+    let job = Job { recipe, plan, object, progress };
+    let hash = recipe.hash();
+    // Two meshes under one name are two captures.
+    let identity = format!("{hash} {:?}", job.object.mesh.bounds());
+    let capture = CaptureInProgress::open(dir, job.description(), &identity)?;
+    let exposure = job.exposure()?;
+    let (mut done, mut rendered, mut form) = (0, 0, "");
+    let groups = job.plan.groups(LIGHTS_PER_SOLUTION);
+    for (g, (views, lights)) in groups.iter().enumerate() {
+        let missing: Vec<usize> = views.iter().copied().filter(|&v| !job.is_written(&capture, v)).collect();
+        done += job.images(views.iter().filter(|v| !missing.contains(v)));
+        let Some(&first) = missing.first() else { continue };
+        let scene = job.scene(lights);
+        let split = job.plan.views[first].split;
+        let seed = recipe.seed ^ if split == Split::Test { HELD_OUT } else { 0 };
+        let options = job.options(seed.wrapping_add((g as u64) << 32));
+        let stage = Stage::Solve(g + 1, groups.len());
+        let bulk = Bulk::solve(&scene, &options, &|f| progress(stage, f))?;
+        form = bulk.form();
+        for v in missing {
+            let view = &job.plan.views[v];
+            let picture = bulk.render(&view.camera, seed ^ v as u64)?;
+            job.write(&capture, view, lights, &picture, exposure)?;
+            let images = view.lights.len();
+            (done, rendered) = (done + images, rendered + images);
+            progress(Stage::Images(done, job.plan.images()), done as f32 / job.plan.images() as f32);
+        }
+    }
+    let points = job.object.surface_points(recipe.film.points as usize, recipe.seed);
+    capture.write_file("points3d.ply", &points_ply(&points))?;
+    let error = if recipe.quality.measure { Some(job.measure()?) } else { None };
+    let record = CaptureRecord {
+        recipe_hash: hash,
+        exposure,
+        form,
+        repairs: job.object.repairs,
+        error,
+        images: job.plan.images(),
+        rendered,
+    };
+    capture.write_file("capture.json", format!("{:#}\n", job.json(&record)).as_bytes())?;
+    capture.finish()?;
+    Ok(record)
+}
+
+impl Job<'_> {
+    fn options(&self, seed: u64) -> BulkOptions {
+        let (quality, default) = (&self.recipe.quality, BulkOptions::default());
+        BulkOptions {
+            points: quality.points.unwrap_or(default.points),
+            walks: quality.walks.unwrap_or(default.walks),
+            samples_per_axis: quality.samples_per_axis.unwrap_or(default.samples_per_axis),
+            seed,
+            ..default
+        }
+    }
+
+    fn scene(&self, lights: &[usize]) -> Scene {
+        let falloff = Falloff::InverseSquare { reference: self.recipe.rig.light_distance };
+        let olat = |l: &usize| Light::Olat { light: self.plan.lights[*l], falloff };
+        Scene {
+            geometry: self.object.geometry.clone(),
+            material: self.recipe.material.material(),
+            lights: lights.iter().map(olat).collect(),
+        }
+    }
+
+    fn description(&self) -> CaptureDescription {
+        let views = |split: Split| {
+            let shot = |view: &PlannedView, light: usize| ShotDescription {
+                name: view.image_name(light),
+                light: self.plan.lights[light],
+                provenance: Provenance::Photograph,
+                weight: 1.0,
+            };
+            let view = |view: &PlannedView| ViewDescription {
+                camera: view.camera,
+                shots: view.lights.iter().map(|&light| shot(view, light)).collect(),
+            };
+            self.plan.views.iter().filter(|v| v.split == split).map(view).collect()
+        };
+        let depth = if self.recipe.film.sixteen_bits { BitDepth::Sixteen } else { BitDepth::Eight };
+        let (train, test) = (views(Split::Train), views(Split::Test));
+        CaptureDescription { train, test, points: None, transfer: Transfer::Srgb, depth }
+    }
+
+    fn images<'v>(&self, views: impl Iterator<Item = &'v usize>) -> usize {
+        views.map(|&v| self.plan.views[v].lights.len()).sum()
+    }
+
+    fn is_written(&self, capture: &CaptureInProgress, v: usize) -> bool {
+        let view = &self.plan.views[v];
+        let last = capture.folder().join(geometry_name(view));
+        last.exists() && (0..view.lights.len()).all(|s| capture.has(view.split, view.number, s))
+    }
+
+    fn write(
+        &self,
+        capture: &CaptureInProgress,
+        view: &PlannedView,
+        solved: &[usize],
+        picture: &BulkView,
+        exposure: f32,
+    ) -> Result<(), SynthError> {
+        let mask = Mask::from_channel(&picture.coverage, 0)
+            .map_err(|e| DatasetError::Write { path: capture.folder().into(), reason: e.to_string() })?;
+        let shots: Vec<(usize, usize)> = view.lights.iter().copied().enumerate().collect();
+        shots.par_iter().try_for_each(|&(s, light)| -> Result<(), SynthError> {
+            let Ok(at) = solved.binary_search(&light) else { return Ok(()) };
+            let radiance = &picture.lights[at];
+            if self.recipe.film.exr {
+                let channel = |c: usize| radiance.data().iter().skip(c).step_by(3).copied().collect();
+                let channels = [("R", channel(0)), ("G", channel(1)), ("B", channel(2))];
+                let bytes = encode_exr(radiance.width(), radiance.height(), channels)?;
+                capture.write_file(&format!("exr/{}_{}.exr", split_name(view), view.image_name(light)), &bytes)?;
+            }
+            let exposed = radiance.map(|v| v * exposure);
+            Ok(capture.write(view.split, view.number, s, &(exposed, Some(mask.clone())))?)
+        })?;
+        let geometry = Geometry { depth: picture.depth.clone(), normal: picture.normal.clone() };
+        Ok(capture.write_file(&geometry_name(view), &geometry.encode()?)?)
+    }
+
+    /// What radiance is multiplied by.
+    fn exposure(&self) -> Result<f32, SynthError> {
+        if let Some(exposure) = self.recipe.film.exposure {
+            return Ok(exposure);
+        }
+        let all: Vec<&PlannedView> = self.plan.views.iter().filter(|v| v.split == Split::Train).collect();
+        let chosen = (0..EXPOSURE_VIEWS.min(all.len())).map(|k| all[k * all.len() / EXPOSURE_VIEWS.min(all.len())]);
+        let mut values = Vec::new();
+        for view in chosen {
+            let mut lights = view.lights.clone();
+            lights.sort_unstable();
+            lights.truncate(LIGHTS_PER_SOLUTION);
+            let (points, walks) = EXPOSURE_EFFORT;
+            let options = BulkOptions { points, walks, samples_per_axis: 1, ..self.options(self.recipe.seed ^ EXPOSED) };
+            let scene = self.scene(&lights);
+            let bulk = Bulk::solve(&scene, &options, &|f| (self.progress)(Stage::Exposure, f))?;
+            let picture = bulk.render(&resized(&view.camera, EXPOSURE_SIDE), self.recipe.seed)?;
+            for image in &picture.lights {
+                let covered = |(_, c): &(&[f32], &f32)| **c > 0.5;
+                let pixels = image.data().chunks_exact(3).zip(picture.coverage.data()).filter(covered);
+                values.extend(pixels.flat_map(|(v, _)| v.iter().copied()));
+            }
+        }
+        values.sort_by(f32::total_cmp);
+        let at = ((1.0 - BRIGHT_SHARE) * values.len() as f64) as usize;
+        let bright = values.get(at).copied().unwrap_or(BRIGHT);
+        // An object that is black stays black.
+        Ok(if bright > f32::MIN_POSITIVE { BRIGHT / bright } else { 1.0 })
+    }
+
+    fn measure(&self) -> Result<BulkError, SynthError> {
+        let views: Vec<&PlannedView> = self.plan.views.iter().filter(|v| v.split == Split::Train).collect();
+        let spread = |n: usize, most: usize| (0..most.min(n)).map(move |k| k * n / most.min(n));
+        let cameras: Vec<Camera> = spread(views.len(), MEASURED_VIEWS)
+            .map(|k| resized(&views[k].camera, MEASURED_SIDE.min(self.recipe.film.resolution)))
+            .collect();
+        let lights: Vec<usize> =
+            spread(views[0].lights.len(), MEASURED_LIGHTS).map(|k| views[0].lights[k]).collect();
+        let reference = ReferenceOptions {
+            samples: MEASURED_PATHS,
+            seed: self.recipe.seed ^ MEASURED,
+            ..ReferenceOptions::default()
+        };
+        let progress = |f| (self.progress)(Stage::Measure, f);
+        Ok(measure_bulk(&self.scene(&lights), &self.options(self.recipe.seed), &cameras, &reference, &progress)?)
+    }
+
+    fn json(&self, record: &CaptureRecord) -> Value {
+        let measured = record.error.map(|e| {
+            json!({
+                "bias": e.bias, "bias_standard_error": e.bias_standard_error, "rmse": e.rmse,
+                "rmse_of_root_mean_square": e.rmse_of_rms, "noise": e.noise, "noise_db": e.noise_db,
+                "against": format!(
+                    "unbiased reference, {MEASURED_PATHS} paths per pixel, {MEASURED_LIGHTS} lights, {MEASURED_VIEWS} views of \
+                     {MEASURED_SIDE}²; relative to the mean radiance"
+                ),
+            })
+        });
+        let lights: Vec<Value> = self.plan.lights.iter().filter_map(OlatLight::position).map(|p| json!(p.to_array())).collect();
+        json!({
+            "renderer": concat!("diamond-pathtrace ", env!("CARGO_PKG_VERSION"), ", bulk"),
+            "recipe": serde_json::to_value(self.recipe).unwrap_or_default(),
+            "recipe_hash": record.recipe_hash,
+            "exposure": record.exposure,
+            "falloff": "inverse square, irradiance 1 at the origin before exposure",
+            "light_positions": lights,
+            "solution": record.form,
+            "repairs": record.repairs.to_string(),
+            "triangles": self.object.mesh.triangles.len(),
+            "error": measured,
+        })
+    }
+}
+
+fn split_name(view: &PlannedView) -> &'static str {
+    if view.split == Split::Train { "train" } else { "test" }
+}
+
+fn geometry_name(view: &PlannedView) -> String {
+    format!("geometry/{}_r_{}.exr", split_name(view), view.number)
+}
+
+/// The same view with `side` pixels along each side, at most as many as it has.
+fn resized(camera: &Camera, side: u32) -> Camera {
+    let k = &camera.intrinsics;
+    let scale = side.min(k.width) as f32 / k.width as f32;
+    let mut intrinsics = *k;
+    (intrinsics.fx, intrinsics.fy) = (k.fx * scale, k.fy * scale);
+    (intrinsics.cx, intrinsics.cy) = (k.cx * scale, k.cy * scale);
+    (intrinsics.width, intrinsics.height) = (side.min(k.width), side.min(k.height));
+    Camera { intrinsics, pose: camera.pose }
+}
