@@ -3,6 +3,7 @@ use diamond_dataset::DatasetError;
 use diamond_metrics::MetricError;
 use diamond_reconstruct::{ReconstructError, io_advice};
 use diamond_splat_files::SplatFileError;
+use diamond_synth::SynthError;
 use std::path::{Path, PathBuf};
 
 /// Errors of this crate.
@@ -132,6 +133,17 @@ impl std::error::Error for SssError {
 impl From<DatasetError> for SssError {
     fn from(e: DatasetError) -> Self {
         Self::Capture(e)
+    }
+}
+
+impl From<SynthError> for SssError {
+    fn from(e: SynthError) -> Self {
+        match e {
+            SynthError::Dataset(e) => Self::Capture(e),
+            SynthError::File { path, source } => Self::Io { path, action: "read the file", source },
+            SynthError::Recipe { origin, detail } => Self::Input { path: origin.into(), detail },
+            SynthError::Pathtrace(e) => Self::Input { path: "recipe".into(), detail: e.to_string() },
+        }
     }
 }
 

@@ -3,6 +3,7 @@ mod cli;
 mod progress;
 mod reconstruct;
 mod signals;
+mod synth;
 
 use clap::Parser;
 use cli::{Cli, Command, RenderArguments};
@@ -49,6 +50,7 @@ fn print(text: &str) {
 fn run(command: Command) -> Result<(), SssError> {
     match command {
         Command::Reconstruct(arguments) => reconstruct::run(arguments),
+        Command::Synth { recipe, output, members } => synth::run(recipe, output, members),
         Command::Evaluate { dir, capture, save_images, instruction_set } => {
             choose_instructions(instruction_set)?;
             let mut counter = Counter::new("evaluating");

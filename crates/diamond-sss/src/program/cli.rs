@@ -110,6 +110,22 @@ says otherwise. PLY customarily has y down,\nSPZ and glTF have y up: --turn x:18
         #[command(flatten)]
         writing: WritingArguments,
     },
+    /// Render a synthetic capture from a recipe, with its error measured against an unbiased path tracer
+    #[command(after_help = "Examples:
+  diamond synth assets/recipes/wax-candle.toml -o candle
+  diamond synth assets/recipes/training-family.toml -o family --members 10
+
+Whoever is interrupted goes on with the same command. Two runs give the same bytes.")]
+    Synth {
+        /// A recipe (TOML), or a family of recipes
+        recipe: PathBuf,
+        /// The capture's folder, which must not exist; of a family, the folder of its captures
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Of a family: only the first so many members
+        #[arg(long, value_name = "COUNT")]
+        members: Option<u32>,
+    },
     /// List the presets, or print one as TOML to start a configuration from
     #[command(after_help = "Examples:\n  diamond presets\n  diamond presets resolved > mine.toml")]
     Presets {
