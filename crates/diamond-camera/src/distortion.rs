@@ -114,7 +114,7 @@ impl Distortion {
                 r * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
             }
             Distortion::Fisheye { k1, k2, k3, k4 } => {
-                let theta = r.atan();
+                let theta = libm::atan(r);
                 let t2 = theta * theta;
                 theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
             }
@@ -130,7 +130,7 @@ impl Distortion {
                 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3))
             }
             Distortion::Fisheye { k1, k2, k3, k4 } => {
-                let theta = r.atan();
+                let theta = libm::atan(r);
                 let t2 = theta * theta;
                 (1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))) / (1.0 + r * r)
             }

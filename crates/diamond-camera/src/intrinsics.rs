@@ -31,14 +31,14 @@ impl Intrinsics {
     /// Square pixels, centred principal point, horizontal field of view `fov_x` in radians (0 … π, both excluded; see
     /// [`Intrinsics::validate`]).
     pub fn from_fov_x(fov_x: f32, width: u32, height: u32) -> Self {
-        let f = 0.5 * width as f32 / (0.5 * fov_x).tan();
+        let f = 0.5 * width as f32 / libm::tanf(0.5 * fov_x);
         Self { fx: f, fy: f, cx: 0.5 * width as f32, cy: 0.5 * height as f32, width, height }
     }
 
     /// Horizontal angle of view in radians; for off-centre principal points, the angle between the left and the right
     /// border.
     pub fn fov_x(&self) -> f32 {
-        (self.cx / self.fx).atan() + ((self.width as f32 - self.cx) / self.fx).atan()
+        libm::atanf(self.cx / self.fx) + libm::atanf((self.width as f32 - self.cx) / self.fx)
     }
 
     /// `Err` unless the focal lengths are finite and positive, the principal point finite and the size not zero.

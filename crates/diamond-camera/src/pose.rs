@@ -113,7 +113,7 @@ impl Pose {
             return Err(fail(format!("last row {last} instead of 0 0 0 1 (a transposed or projective matrix)")));
         }
         let axes = Mat3::from_mat4(matrix);
-        let scale = axes.determinant().cbrt();
+        let scale = libm::cbrtf(axes.determinant());
         if scale.is_nan() || scale <= 1e-8 {
             return Err(fail(format!("determinant {} (a mirrored or flat matrix)", axes.determinant())));
         }
@@ -165,11 +165,26 @@ impl Pose {
     pub fn interpolate(&self, other: &Pose, t: f32) -> Pose {
         let a = Quat::from_mat3(&self.rotation);
         let b = Quat::from_mat3(&other.rotation);
-        let rotation = Mat3::from_quat(a.slerp(b, t).normalize());
+        let rotation = Mat3::from_quat(slerp(a, b, t).normalize());
         let centre = self.centre().lerp(other.centre(), t);
         Pose { rotation, translation: -(rotation * centre) }
     }
 }
+
+/// From unit quaternion `a` to `b` on the shorter arc. `[eq:pose-slerp]` (sin((1−t)θ)·a + sin(tθ)·b)/sin θ.
+fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
+    let b = if a.dot(b) < 0.0 { -b } else { b };
+    // Half the angle by its sine and cosine: exact for small angles, where 1 − a·b has no digits left.
+    let theta = 2.0 * libm::atan2f((a - b).length(), (a + b).length());
+    let sin = libm::sinf(theta);
+    if sin < SMALL_ANGLE {
+        return a * (1.0 - t) + b * t;
+    }
+    (a * libm::sinf((1.0 - t) * theta) + b * libm::sinf(t * theta)) * (1.0 / sin)
+}
+
+/// Below this angle the arc is straight to all digits, and its sine a bad divisor.
+const SMALL_ANGLE: f32 = 1e-4;
 
 #[cfg(test)]
 mod tests {

@@ -41,14 +41,14 @@ impl CameraRig {
         check_distance(distance)?;
         check_elevation(min_elevation)?;
         let (tangent, bitangent) = up.any_orthonormal_pair();
-        let lowest = f64::from(min_elevation).sin();
+        let lowest = libm::sin(f64::from(min_elevation));
         let cameras = (0..count)
             .map(|i| {
                 // The cap's area is proportional to its height, so equal steps of height are equal areas.
                 let z = 1.0 - (1.0 - lowest) * (i as f64 + 0.5) / count as f64;
                 let radius = (1.0 - z * z).max(0.0).sqrt();
                 let phi = (i as f64 * GOLDEN_ANGLE) % std::f64::consts::TAU;
-                let (x, y) = (radius * phi.cos(), radius * phi.sin());
+                let (x, y) = (radius * libm::cos(phi), radius * libm::sin(phi));
                 let direction = tangent * x as f32 + bitangent * y as f32 + up * z as f32;
                 Camera { intrinsics, pose: Pose::look_at(target + direction * distance, target, up) }
             })

@@ -42,7 +42,7 @@ impl Trajectory {
         check_distance(distance)?;
         check_elevation(elevation)?;
         let (start, _) = up.any_orthonormal_pair();
-        let eye = target + (start * elevation.cos() + up * elevation.sin()) * distance;
+        let eye = target + (start * libm::cosf(elevation) + up * libm::sinf(elevation)) * distance;
         Ok(Trajectory::Orbit { eye, target, up })
     }
 
@@ -77,7 +77,8 @@ impl Trajectory {
         let t = if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) };
         match self {
             Trajectory::Orbit { eye, target, up } => {
-                let turn = Quat::from_axis_angle(*up, t * std::f32::consts::TAU);
+                let (sin, cos) = libm::sincosf(t * std::f32::consts::PI);
+                let turn = Quat::from_xyzw(up.x * sin, up.y * sin, up.z * sin, cos);
                 Pose::look_at(*target + turn * (*eye - *target), *target, *up)
             }
             Trajectory::Keyframes { poses, .. } if poses.is_empty() => Pose::IDENTITY,

@@ -23,9 +23,9 @@ impl Geometry {
     pub fn encode(&self) -> Result<Vec<u8>, DatasetError> {
         let (width, height, _) = self.depth.shape();
         let sizes = self.depth.expect_shape((width, height, 1), "depth");
-        sizes.and_then(|()| self.normal.expect_shape((width, height, 3), "normals")).map_err(|e| {
-            DatasetError::Write { path: "geometry".into(), reason: e.to_string() }
-        })?;
+        sizes
+            .and_then(|()| self.normal.expect_shape((width, height, 3), "normals"))
+            .map_err(|e| DatasetError::Write { path: "geometry".into(), reason: e.to_string() })?;
         let normal = |c: usize| self.normal.data().iter().skip(c).step_by(3).copied().collect();
         let channels = [
             ("depth.z", self.depth.data().to_vec()),

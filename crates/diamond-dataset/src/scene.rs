@@ -46,7 +46,7 @@ const SEEN_ANGLE: f32 = 0.5 * std::f32::consts::PI / 180.0;
 
 /// Angle between unit vectors in radians, exact for small angles.
 fn angle(a: Vec3, b: Vec3) -> f32 {
-    2.0 * (0.5 * (a - b).length()).min(1.0).asin()
+    2.0 * libm::asinf((0.5 * (a - b).length()).min(1.0))
 }
 
 /// Unit direction from `centre` to a light; +z where the light is at the centre.

@@ -160,7 +160,7 @@ pub(crate) fn frames(dir: &Path, folder: &str, views: &[ViewDescription]) -> Res
 pub(crate) fn write_transforms(dir: &Path, description: &CaptureDescription) -> Result<(), DatasetError> {
     for (_, folder, views) in splits(description) {
         let camera = &views[0].camera.intrinsics;
-        let fov_x = 2.0 * (0.5 * f64::from(camera.width) / f64::from(camera.fx)).atan();
+        let fov_x = 2.0 * libm::atan(0.5 * f64::from(camera.width) / f64::from(camera.fx));
         let json = json!({ "camera_angle_x": fov_x, "frames": frames(dir, folder, views)? });
         write_synced(&dir.join(format!("transforms_{folder}.json")), format!("{json:#}\n").as_bytes())?;
         sync_folder(&dir.join(folder))?;

@@ -36,8 +36,8 @@ impl Transfer {
         let linear = match self {
             Transfer::Linear => v,
             Transfer::Srgb if v <= 0.04045 => v / 12.92,
-            Transfer::Srgb => ((v + 0.055) / 1.055).powf(2.4),
-            Transfer::Gamma22 => v.powf(2.2),
+            Transfer::Srgb => libm::powf((v + 0.055) / 1.055, 2.4),
+            Transfer::Gamma22 => libm::powf(v, 2.2),
         };
         // `min` would turn NaN into a number.
         if linear > f32::MAX { f32::MAX.copysign(stored) } else { linear.copysign(stored) }
@@ -50,8 +50,8 @@ impl Transfer {
         let slope = match self {
             Transfer::Linear => 1.0,
             Transfer::Srgb if v <= 0.04045 => 1.0 / 12.92,
-            Transfer::Srgb => 2.4 / 1.055 * ((v + 0.055) / 1.055).powf(1.4),
-            Transfer::Gamma22 => 2.2 * v.powf(1.2),
+            Transfer::Srgb => 2.4 / 1.055 * libm::powf((v + 0.055) / 1.055, 1.4),
+            Transfer::Gamma22 => 2.2 * libm::powf(v, 1.2),
         };
         finite_product(d_linear, slope)
     }
@@ -63,8 +63,8 @@ impl Transfer {
         let stored = match self {
             Transfer::Linear => v,
             Transfer::Srgb if v <= 0.003_130_8 => v * 12.92,
-            Transfer::Srgb => 1.055 * v.powf(1.0 / 2.4) - 0.055,
-            Transfer::Gamma22 => v.powf(1.0 / 2.2),
+            Transfer::Srgb => 1.055 * libm::powf(v, 1.0 / 2.4) - 0.055,
+            Transfer::Gamma22 => libm::powf(v, 1.0 / 2.2),
         };
         stored.copysign(linear)
     }
@@ -77,8 +77,8 @@ impl Transfer {
         let slope = match self {
             Transfer::Linear => 1.0,
             Transfer::Srgb if v <= 0.003_130_8 => 12.92,
-            Transfer::Srgb => 1.055 / 2.4 * v.powf(1.0 / 2.4 - 1.0),
-            Transfer::Gamma22 => v.max(GAMMA_SLOPE_FLOOR).powf(1.0 / 2.2 - 1.0) / 2.2,
+            Transfer::Srgb => 1.055 / 2.4 * libm::powf(v, 1.0 / 2.4 - 1.0),
+            Transfer::Gamma22 => libm::powf(v.max(GAMMA_SLOPE_FLOOR), 1.0 / 2.2 - 1.0) / 2.2,
         };
         finite_product(d_stored, slope)
     }

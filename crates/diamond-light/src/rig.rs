@@ -98,14 +98,14 @@ fn dome_directions(count: usize, up: Vec3, min_elevation: f32) -> Result<Vec<Vec
         });
     }
     let (tangent, bitangent) = up.any_orthonormal_pair();
-    let lowest = f64::from(min_elevation).sin();
+    let lowest = libm::sin(f64::from(min_elevation));
     Ok((0..count)
         .map(|i| {
             // The cap's area is proportional to its height, so equal steps of height are equal areas.
             let z = 1.0 - (1.0 - lowest) * (i as f64 + 0.5) / count as f64;
             let radius = (1.0 - z * z).max(0.0).sqrt();
             let phi = (i as f64 * GOLDEN_ANGLE) % std::f64::consts::TAU;
-            let (x, y) = (radius * phi.cos(), radius * phi.sin());
+            let (x, y) = (radius * libm::cos(phi), radius * libm::sin(phi));
             (tangent * x as f32 + bitangent * y as f32 + up * z as f32).normalize()
         })
         .collect())

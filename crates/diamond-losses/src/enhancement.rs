@@ -11,7 +11,7 @@ use crate::{ImageLoss, LossError};
 pub fn enhanced(g: [f32; 3]) -> [f32; 3] {
     let g = g.map(|v| if v > 0.0 { v.min(1.0) } else { 0.0 });
     let brightest = g[0].max(g[1]).max(g[2]);
-    let w = 1.0 / (1.0 + (-5.0 * (brightest - 0.5)).exp());
+    let w = 1.0 / (1.0 + libm::expf(-5.0 * (brightest - 0.5)));
     g.map(|g| w * g * g + (1.0 - w) * (1.0 - (1.0 - g) * (1.0 - g)))
 }
 

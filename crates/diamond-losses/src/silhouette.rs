@@ -29,10 +29,10 @@ pub fn mask_bce(opacity: &Image, mask: &Mask) -> Result<ImageLoss, LossError> {
     for ((g, &o), &m) in grad.data_mut().iter_mut().zip(opacity.data()).zip(mask.data()) {
         let ((o, passes), m) = (clamped(o), f64::from(m));
         if m > 0.0 {
-            sum -= m * o.ln();
+            sum -= m * libm::log(o);
         }
         if m < 1.0 {
-            sum -= (1.0 - m) * (1.0 - o).ln();
+            sum -= (1.0 - m) * libm::log(1.0 - o);
         }
         if passes {
             *g = (scale * (o - m) / (o * (1.0 - o))) as f32;
@@ -44,7 +44,7 @@ pub fn mask_bce(opacity: &Image, mask: &Mask) -> Result<ImageLoss, LossError> {
 /// Entropy of one clamped opacity, and its derivative.
 fn entropy(opacity: f32) -> (f64, f64) {
     let (o, passes) = clamped(opacity);
-    let (a, b) = (o.ln(), (1.0 - o).ln());
+    let (a, b) = (libm::log(o), libm::log(1.0 - o));
     (-(o * a + (1.0 - o) * b), if passes { b - a } else { 0.0 })
 }
 

@@ -34,7 +34,7 @@ impl EdgeWeights {
             }
             let (i, j) = (p * channels, r * channels);
             let edge: f64 = (0..channels).map(|c| (f64::from(photo[j + c]) - f64::from(photo[i + c])).abs()).sum();
-            inside * (-(edge / channels as f64) as f32).exp()
+            inside * libm::expf(-(edge / channels as f64) as f32)
         };
         let (mut right, mut down) = (vec![0.0; width * height], vec![0.0; width * height]);
         for y in 0..height {

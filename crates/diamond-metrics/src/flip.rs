@@ -107,7 +107,7 @@ impl Viewer {
             let terms: Vec<(f64, Vec<f64>)> = gaussians
                 .iter()
                 .map(|&(a, b)| {
-                    let tap = |i: usize| (-pi2 * (i as f64 / pixels_per_degree).powi(2) / b).exp();
+                    let tap = |i: usize| libm::exp(-pi2 * (i as f64 / pixels_per_degree).powi(2) / b);
                     (a * (std::f64::consts::PI / b).sqrt(), (0..=radius).map(tap).collect())
                 })
                 .collect();
@@ -118,7 +118,7 @@ impl Viewer {
 
         let sigma = 0.5 * FEATURE_DEGREES * pixels_per_degree;
         let radius = (3.0 * sigma).ceil() as i64;
-        let gaussian = |x: i64| (-((x * x) as f64) / (2.0 * sigma * sigma)).exp();
+        let gaussian = |x: i64| libm::exp(-((x * x) as f64) / (2.0 * sigma * sigma));
         let smooth_sum: f64 = (-radius..=radius).map(gaussian).sum();
         // A derivative's positive taps sum to 1 and its negative ones to −1.
         let balance = |taps: Vec<f64>| {
@@ -127,8 +127,8 @@ impl Viewer {
             taps.into_iter().map(|v| if v > 0.0 { v / positive } else { v / negative }).collect()
         };
         let primaries = Primaries::srgb();
-        let largest =
-            hyab(primaries.hunt_lab([0.0, 1.0, 0.0]), primaries.hunt_lab([0.0, 0.0, 1.0])).powf(COLOUR_EXPONENT);
+        let extremes = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|rgb| primaries.hunt_lab(rgb));
+        let largest = libm::pow(hyab(extremes[0], extremes[1]), COLOUR_EXPONENT);
         Ok(Self {
             primaries,
             sensitivity,
@@ -151,8 +151,8 @@ impl Viewer {
             .map(|i| {
                 let colour = self.compress(hyab(seen_a[i], seen_b[i]));
                 let feature = (edge_a[i] - edge_b[i]).abs().max((point_a[i] - point_b[i]).abs());
-                let feature = (feature / std::f64::consts::SQRT_2).powf(FEATURE_EXPONENT);
-                colour.powf(1.0 - feature.min(1.0))
+                let feature = libm::pow(feature / std::f64::consts::SQRT_2, FEATURE_EXPONENT);
+                libm::pow(colour, 1.0 - feature.min(1.0))
             })
             .collect()
     }
@@ -186,14 +186,14 @@ impl Viewer {
         let magnitude = |taps: &[f64]| -> Plane {
             let x = filter(&smooth_y, width, height, taps, Axis::X);
             let y = filter(&smooth_x, width, height, taps, Axis::Y);
-            x.iter().zip(y).map(|(x, y)| x.hypot(y)).collect()
+            x.iter().zip(y).map(|(x, y)| libm::hypot(*x, y)).collect()
         };
         (magnitude(&self.edge), magnitude(&self.point))
     }
 
     /// HyAB distance → `[0, 1]`: a power, then linear to the knee and linear above it.
     fn compress(&self, distance: f64) -> f64 {
-        let v = distance.powf(COLOUR_EXPONENT);
+        let v = libm::pow(distance, COLOUR_EXPONENT);
         let knee = KNEE * self.largest;
         let error = if v < knee {
             KNEE_ERROR / knee * v

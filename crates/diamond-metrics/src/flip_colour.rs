@@ -59,7 +59,7 @@ impl Primaries {
     pub fn hunt_lab(&self, rgb: Triple) -> Triple {
         const DELTA: f64 = 6.0 / 29.0;
         let f = multiply(&self.to_relative_xyz, rgb)
-            .map(|t| if t > DELTA * DELTA * DELTA { t.cbrt() } else { t / (3.0 * DELTA * DELTA) + 4.0 / 29.0 });
+            .map(|t| if t > DELTA * DELTA * DELTA { libm::cbrt(t) } else { t / (3.0 * DELTA * DELTA) + 4.0 / 29.0 });
         let lightness = 116.0 * f[1] - 16.0;
         let hunt = 0.01 * lightness;
         [lightness, hunt * 500.0 * (f[0] - f[1]), hunt * 200.0 * (f[1] - f[2])]
@@ -73,12 +73,12 @@ pub(crate) fn achromatic(luma: f64) -> f64 {
 
 /// sRGB value in `[0, 1]` → linear.
 pub(crate) fn srgb_decode(v: f64) -> f64 {
-    if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+    if v <= 0.04045 { v / 12.92 } else { libm::pow((v + 0.055) / 1.055, 2.4) }
 }
 
 /// The HyAB distance of two L*a*b* colours: |ΔL| + √(Δa² + Δb²), made for large differences.
 pub(crate) fn hyab(p: Triple, q: Triple) -> f64 {
-    (p[0] - q[0]).abs() + (p[1] - q[1]).hypot(p[2] - q[2])
+    (p[0] - q[0]).abs() + libm::hypot(p[1] - q[1], p[2] - q[2])
 }
 
 #[cfg(test)]

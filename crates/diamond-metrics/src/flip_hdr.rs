@@ -143,9 +143,9 @@ pub fn flip_exposures(reference: &Image, tone_mapper: FlipToneMapper) -> Result<
         return Err(MetricError::BlackReference);
     }
     let median = luminances[luminances.len() / 2].max(LEAST_MEDIAN).min(largest);
-    let start = (tone_mapper.nearly_white() / largest).log2();
+    let start = libm::log2(tone_mapper.nearly_white() / largest);
     // From the ratio itself, so that a whole number of stops stays whole under the ceiling.
-    let span = (largest / median).log2();
+    let span = libm::log2(largest / median);
     Ok(FlipExposures { start, stop: start + span, count: (span.ceil() as usize).max(2) })
 }
 
@@ -179,7 +179,7 @@ pub fn flip_hdr(reference: &Image, test: &Image, options: FlipHdrOptions) -> Res
     for i in 0..count {
         let exposure = start + (stop - start) * i as f64 / (count - 1).max(1) as f64;
         let display = |v: &[Triple]| -> Vec<Triple> {
-            v.iter().map(|c| options.tone_mapper.display(c.map(|v| v * exposure.exp2()))).collect()
+            v.iter().map(|c| options.tone_mapper.display(c.map(|v| v * libm::exp2(exposure)))).collect()
         };
         let map = viewer.compare(&display(&a), &display(&b), width, height);
         worst.iter_mut().zip(map).for_each(|(w, v)| *w = v.max(*w));

@@ -45,7 +45,7 @@ pub fn l1(a: &Image, b: &Image) -> Result<f64, MetricError> {
 }
 
 fn decibel(mse: f64, peak: f64) -> f64 {
-    if mse == 0.0 { f64::INFINITY } else { 10.0 * (peak * peak / mse).log10() }
+    if mse == 0.0 { f64::INFINITY } else { 10.0 * libm::log10(peak * peak / mse) }
 }
 
 fn expect_peak(peak: f64) -> Result<(), MetricError> {

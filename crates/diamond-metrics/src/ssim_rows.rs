@@ -21,7 +21,7 @@ const C2: f64 = 9e-4;
 
 /// Half of the symmetric window, edge to centre, normalised so that the eleven taps sum to 1.
 fn half_window() -> [f64; RADIUS + 1] {
-    let tap = |k: usize| (-((RADIUS - k) as f64).powi(2) / (2.0 * SIGMA * SIGMA)).exp();
+    let tap = |k: usize| libm::exp(-((RADIUS - k) as f64).powi(2) / (2.0 * SIGMA * SIGMA));
     let sum: f64 = (0..RADIUS).map(|k| 2.0 * tap(k)).sum::<f64>() + tap(RADIUS);
     std::array::from_fn(|k| tap(k) / sum)
 }

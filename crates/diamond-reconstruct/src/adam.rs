@@ -51,8 +51,8 @@ type Part<'a> = (((&'a mut [f32], &'a mut [f32]), &'a mut [f32]), &'a [f32]);
 /// One update of `values` along `gradient`; `t` counts updates from 1. All slices have equal lengths. The same bits
 /// whatever the number of threads.
 pub fn adam_step(values: &mut [f32], moments: &mut Moments, gradient: &[f32], rate: f32, t: u64, rows: Rows) {
-    let correction_1 = 1.0 - (BETA_1 as f64).powf(t as f64);
-    let correction_2 = 1.0 - (BETA_2 as f64).powf(t as f64);
+    let correction_1 = 1.0 - libm::pow(BETA_1 as f64, t as f64);
+    let correction_2 = 1.0 - libm::pow(BETA_2 as f64, t as f64);
     let step = (rate as f64 / correction_1) as f32;
     let scale = (1.0 / correction_2.sqrt()) as f32;
     let level = Level::current();

@@ -303,12 +303,27 @@ pub struct ExposureSettings {
     pub mode: ExposureMode,
     /// Whether red, green and blue have gains of their own.
     pub per_channel: bool,
-    /// Largest step of the logarithm of a gain; falls as the rates of the Gaussians' attributes do.
+    /// Share of the way to the gain that fits best, per visit of a photograph; falls as the rates of the Gaussians'
+    /// attributes do. Below 1 the model has time to imitate a gain before it is found.
     pub rate: f32,
-    /// Pull of a gain's logarithm toward 0, over its largest step.
+    /// Gains stay as they are before this fraction of the run…
+    #[serde(default = "gains_from")]
+    pub from: f32,
+    /// …and after this one.
+    #[serde(default = "gains_until")]
+    pub until: f32,
+    /// Shrinks the logarithm of a gain: it goes to 1/(1 + this) of the one that fits best.
     pub prior: f32,
     /// How the unit of light is first chosen.
     pub first: FirstExposure,
+}
+
+fn gains_from() -> f32 {
+    0.1
+}
+
+fn gains_until() -> f32 {
+    0.4
 }
 
 /// Masking–shadowing variant.
@@ -690,6 +705,9 @@ impl Config {
             ("initial.flatness", self.initial.flatness),
             ("splat.max_alpha", self.splat.max_alpha),
             ("density.prune_opacity", self.density.prune_opacity),
+            ("exposure.rate", self.exposure.rate),
+            ("exposure.from", self.exposure.from),
+            ("exposure.until", self.exposure.until),
             ("density.from", self.density.from),
             ("density.until", self.density.until),
             ("density.reset_every", self.density.reset_every),
@@ -720,7 +738,6 @@ impl Config {
         }
         let d = &self.density;
         let not_negative = [
-            ("exposure.rate", self.exposure.rate),
             ("exposure.prior", self.exposure.prior),
             ("density.gradient_threshold", d.gradient_threshold),
             ("density.percent_dense", d.percent_dense),

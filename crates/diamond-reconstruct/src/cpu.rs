@@ -1,7 +1,6 @@
 //! The CPU engine: one training step, written out in order.
 //!
 //! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
-use crate::exposure::GainGrad;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
@@ -186,7 +185,7 @@ impl Engine for CpuEngine {
         let mut psnr = 0.0;
         let mut visible = 0;
         self.profile.add("activate", start);
-        let mut gains: Vec<(usize, GainGrad)> = Vec::new();
+        let mut gains: Vec<(usize, [f32; 3])> = Vec::new();
         let share = 1.0 / batch.len().max(1) as f32;
         let needs = self.needs.at(plan);
         for pair in batch {
@@ -216,10 +215,14 @@ impl Engine for CpuEngine {
             };
             let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
             let gain = self.model.exposure.index(self.model.config.exposure.mode, pair.view, pair.image);
-            let gain_value = gain.map(|i| self.model.exposure.gain(i));
+            let step_gain = gain.map(|i| {
+                let model = &self.model;
+                move |fitted| model.exposure.toward(&model.config, i, fitted, plan.exposure_factor)
+            });
             let mut outcome = None;
             let pulled = forward::value_and_grad(&pass, &mut meters, |view| {
-                let mut o = objective::evaluate(&self.model.config, &needs, view, pair, share, gain_value)?;
+                let step_gain = step_gain.as_ref().map(|f| f as &dyn Fn([Option<f32>; 3]) -> [f32; 3]);
+                let mut o = objective::evaluate(&self.model.config, &needs, view, pair, share, step_gain)?;
                 let grad = std::mem::take(&mut o.grad);
                 outcome = Some(o);
                 Ok(grad)
@@ -229,12 +232,7 @@ impl Engine for CpuEngine {
                 self.counters.add("PSNR encoded anew", usize::from(outcome.psnr_encoded));
                 terms.add(&outcome.terms, share);
                 psnr += outcome.psnr * share;
-                if let Some(i) = gain {
-                    if !gains.iter().any(|(j, _)| *j == i) {
-                        gains.push((i, GainGrad::default()));
-                    }
-                    gains.iter_mut().filter(|(j, _)| *j == i).for_each(|(_, d)| d.add(&outcome.gain, share));
-                }
+                gains.extend(gain.zip(outcome.log_gain));
             }
             visible = pulled.visible;
             let t = Instant::now();
@@ -277,15 +275,8 @@ impl Engine for CpuEngine {
         }
         let t = Instant::now();
         self.apply(step, plan, &activated, &total, &network_grad)?;
-        for (i, d) in gains {
-            if !d.log_gain.is_finite() || !d.weight.is_finite() {
-                return Err(ReconstructError::NonFinite {
-                    what: "the gradient of a photograph's gain".into(),
-                    step,
-                    detail: format!("gain {i}: {}", d.log_gain),
-                });
-            }
-            self.model.exposure.step(&self.model.config, i, &d, plan.attribute_factor);
+        for (i, log_gain) in gains {
+            self.model.exposure.set(self.model.config.exposure.mode, i, log_gain);
         }
         let t = self.profile.add("adam", t);
         let density = self.control_density(step, plan)?;

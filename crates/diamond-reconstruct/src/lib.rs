@@ -50,7 +50,7 @@ pub use counters::Counters;
 pub use cpu::{CpuEngine, Profile};
 pub use engine::{Engine, Rendering, StepReport, TrainingPair};
 pub use error::{ReconstructError, io_advice};
-pub use exposure::{Exposure, ExposureFile, NamedGain};
+pub use exposure::{Exposure, ExposureFile, NamedGain, fitted_gain};
 pub use facts::CaptureFacts;
 pub use instruction_choice::InstructionChoice;
 pub use model::Model;

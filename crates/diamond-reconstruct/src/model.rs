@@ -243,7 +243,7 @@ impl Model {
         if p.covariance() == Covariance::Cholesky {
             let g = &activated.gaussians;
             for k in 0..3 {
-                let values = g.scales.iter().map(|s| s[k].max(f32::MIN_POSITIVE).ln()).collect();
+                let values = g.scales.iter().map(|s| libm::logf(s[k].max(f32::MIN_POSITIVE))).collect();
                 table.push(format!("scale_{k}"), ScalarType::F32, values);
             }
             for (k, component) in [3, 0, 1, 2].into_iter().enumerate() {

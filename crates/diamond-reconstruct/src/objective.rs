@@ -3,7 +3,7 @@
 //! Terms are computed on the region of the picture that is not empty. They are means over pixels, so that the mean over
 //! the picture is the mean over the region times the region's share of the pixels, plus, for the mask's cross-entropy,
 //! what an empty pixel costs there.
-use crate::exposure::{GainGrad, expose, expose_pull};
+use crate::exposure::{expose, expose_pull, fitted_gain};
 use crate::forward::{PairGrad, View, ViewGrad};
 use crate::needs::StepNeeds;
 use crate::random::Random;
@@ -62,8 +62,8 @@ pub struct Outcome {
     pub psnr: f32,
     /// Whether both pictures were encoded once more for it.
     pub psnr_encoded: bool,
-    /// Gradient of the logarithm of the photograph's gain; zero without one.
-    pub gain: GainGrad,
+    /// Logarithms of the photograph's gain after this visit, if it has one.
+    pub log_gain: Option<[f32; 3]>,
 }
 
 fn add_scaled(to: &mut Option<Image>, from: &Image, scale: f32) {
@@ -83,23 +83,23 @@ fn display_error(rendered: &Image, target: &Image) -> Result<f64, ReconstructErr
 
 /// PSNR with peak 1 of a mean squared error, dB.
 fn decibel(error: f64) -> f32 {
-    if error > 0.0 { (-10.0 * error.log10()).min(PSNR_CAP) as f32 } else { PSNR_CAP as f32 }
+    if error > 0.0 { (-10.0 * libm::log10(error)).min(PSNR_CAP) as f32 } else { PSNR_CAP as f32 }
 }
 
 /// Cross-entropy of a pixel that neither the mask nor a Gaussian covers: not 0, since opacities are kept off 0.
 fn empty_pixel_entropy() -> f64 {
-    -(1.0 - diamond_losses::OPACITY_MARGIN).ln()
+    -libm::log(1.0 - diamond_losses::OPACITY_MARGIN)
 }
 
 /// Value and gradient of every image term for one pair, with weight `share` in the batch. The photographic terms see the
-/// rendering under `gain`, if any.
+/// rendering under its gain: what `gain` makes of the gain that fits best here.
 pub fn evaluate(
     config: &Config,
     needs: &StepNeeds,
     view: &View<'_>,
     pair: &TrainingPair<'_>,
     share: f32,
-    gain: Option<Vec3>,
+    gain: Option<&dyn Fn([Option<f32>; 3]) -> [f32; 3]>,
 ) -> Result<Outcome, ReconstructError> {
     let loss = &config.loss;
     let (shaded, maps) = (view.shaded, &view.shaded.maps);
@@ -121,6 +121,8 @@ pub fn evaluate(
         space: loss.space.transfer(),
         window: SsimWindow::ZeroPadded,
     };
+    let log_gain = gain.map(|step| step(fitted_gain(&shaded.radiance, &target, mask, config.exposure.per_channel)));
+    let gain = log_gain.map(|g| Vec3::from(g.map(libm::expf)));
     let exposed = gain.map(|g| expose(&shaded.radiance, g));
     let rendered = exposed.as_ref().unwrap_or(&shaded.radiance);
     let weight = pair.weight;
@@ -132,9 +134,8 @@ pub fn evaluate(
     if loss.l2 > 0.0 {
         terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: part(photometric.l2) });
     }
-    let mut d_gain = GainGrad::default();
-    if let (Some(gain), Some(exposed)) = (gain, &exposed) {
-        d_gain = expose_pull(exposed, gain, &mut photometric.grad);
+    if let Some(gain) = gain {
+        expose_pull(gain, &mut photometric.grad);
     }
     // Gradients of means over the region become those of means over the picture with the share of the batch.
     let scale = part(share);
@@ -215,7 +216,7 @@ pub fn evaluate(
         Some(error) => f64::from(error),
         None => display_error(rendered, &target)?,
     };
-    Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none(), gain: d_gain })
+    Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none(), log_gain })
 }
 
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.

@@ -181,13 +181,13 @@ const CLAMP_SLACK: f32 = 1e-6;
 
 /// Logistic function.
 pub fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + (-x).exp())
+    1.0 / (1.0 + libm::expf(-x))
 }
 
 /// Inverse of [`sigmoid`] for p in (0, 1); clamped 1e-6 inside so that it is finite.
 pub fn logit(p: f32) -> f32 {
     let p = p.clamp(1e-6, 1.0 - 1e-6);
-    (p / (1.0 - p)).ln()
+    libm::logf(p / (1.0 - p))
 }
 
 fn vec3s(values: &[f32]) -> impl Iterator<Item = Vec3> + '_ {
@@ -198,24 +198,24 @@ fn vec3s(values: &[f32]) -> impl Iterator<Item = Vec3> + '_ {
 /// no unit, a change of size moves the diagonal alone, and one learning rate suits Gaussians of any size. `shear` holds
 /// yx, zx, zy.
 fn lower_factor(log_diagonal: Vec3, shear: Vec3) -> LowerFactor {
-    let [x, y, z] = log_diagonal.exp().to_array();
-    let [yx, zx, zy] = (shear * (log_diagonal.element_sum() / 3.0).exp()).to_array();
+    let [x, y, z] = log_diagonal.map(libm::expf).to_array();
+    let [yx, zx, zy] = (shear * libm::expf(log_diagonal.element_sum() / 3.0)).to_array();
     LowerFactor([x, yx, y, zx, zy, z])
 }
 
 /// Pullback of [`lower_factor`]: to the log-diagonal and to the shear.
 fn lower_factor_pull(log_diagonal: Vec3, shear: Vec3, d: &LowerFactor) -> (Vec3, Vec3) {
     let [xx, yx, yy, zx, zy, zz] = d.0;
-    let size = (log_diagonal.element_sum() / 3.0).exp();
+    let size = libm::expf(log_diagonal.element_sum() / 3.0);
     let d_shear = Vec3::new(yx, zx, zy) * size;
-    (Vec3::new(xx, yy, zz) * log_diagonal.exp() + Vec3::splat(d_shear.dot(shear) / 3.0), d_shear)
+    (Vec3::new(xx, yy, zz) * log_diagonal.map(libm::expf) + Vec3::splat(d_shear.dot(shear) / 3.0), d_shear)
 }
 
 /// Raw values of a factor; diagonal entries count as at least `least` (above 0).
 fn raw_of_factor(factor: &LowerFactor, least: f32) -> (Vec3, Vec3) {
     let [xx, yx, yy, zx, zy, zz] = factor.0;
-    let log_diagonal = Vec3::new(xx, yy, zz).max(Vec3::splat(least)).map(f32::ln);
-    let size = (log_diagonal.element_sum() / 3.0).exp();
+    let log_diagonal = Vec3::new(xx, yy, zz).max(Vec3::splat(least)).map(libm::logf);
+    let size = libm::expf(log_diagonal.element_sum() / 3.0);
     (log_diagonal, Vec3::new(yx, zx, zy) / size)
 }
 
@@ -224,7 +224,7 @@ impl GaussianParameters {
     pub fn set_covariance(&mut self, i: usize, scale: Vec3, rotation: Quat) {
         match self.covariance {
             Covariance::RotationScale => {
-                self.row_mut(Attribute::Scale, i).copy_from_slice(&scale.map(f32::ln).to_array());
+                self.row_mut(Attribute::Scale, i).copy_from_slice(&scale.map(libm::logf).to_array());
                 let wxyz = [rotation.w, rotation.x, rotation.y, rotation.z];
                 self.row_mut(Attribute::Rotation, i).copy_from_slice(&wxyz);
             }
@@ -239,14 +239,14 @@ impl GaussianParameters {
 
     /// Multiplies all standard deviations of Gaussian `i`: in either form the same number is added to three logarithms.
     pub fn scale_covariance(&mut self, i: usize, factor: f32) {
-        self.row_mut(Attribute::Scale, i).iter_mut().for_each(|s| *s += factor.ln());
+        self.row_mut(Attribute::Scale, i).iter_mut().for_each(|s| *s += libm::logf(factor));
     }
 
     /// Keeps every standard deviation in `low..=high` (scene units): eigenvalues of the covariance, whatever its form.
     /// A projection after the step, so that it stops no gradient.
     pub fn clamp_covariances(&mut self, low: f32, high: f32) {
         if self.covariance == Covariance::RotationScale {
-            let (low, high) = (low.ln(), high.ln());
+            let (low, high) = (libm::logf(low), libm::logf(high));
             self.values_mut(Attribute::Scale).iter_mut().for_each(|s| *s = s.clamp(low, high));
             return;
         }
@@ -341,7 +341,7 @@ impl GaussianParameters {
         };
         match self.covariance {
             Covariance::RotationScale => {
-                gaussians.scales = vec3s(self.values(Attribute::Scale)).map(Vec3::exp).collect();
+                gaussians.scales = vec3s(self.values(Attribute::Scale)).map(|log: Vec3| log.map(libm::expf)).collect();
                 let quaternions = self.values(Attribute::Rotation).chunks_exact(4);
                 gaussians.rotations = quaternions.map(|q| Quat::from_xyzw(q[1], q[2], q[3], q[0])).collect();
             }

@@ -54,8 +54,8 @@ impl Random {
 
     /// Standard normal (Box–Muller).
     pub fn normal(&mut self) -> f32 {
-        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        radius * (std::f32::consts::TAU * self.uniform()).cos()
+        let radius = (-2.0 * libm::logf(1.0 - self.uniform())).sqrt();
+        radius * libm::cosf(std::f32::consts::TAU * self.uniform())
     }
 
     /// Three independent standard normals.
@@ -68,12 +68,13 @@ impl Random {
         let z = 1.0 - 2.0 * self.uniform();
         let phi = std::f32::consts::TAU * self.uniform();
         let r = (1.0 - z * z).max(0.0).sqrt();
-        Vec3::new(r * phi.cos(), r * phi.sin(), z)
+        Vec3::new(r * libm::cosf(phi), r * libm::sinf(phi), z)
     }
 
     /// A rotation that takes +z to `axis` (unit), with a random spin about it.
     pub fn rotation_with_axis(&mut self, axis: Vec3) -> Quat {
-        Quat::from_rotation_arc(Vec3::Z, axis) * Quat::from_rotation_z(std::f32::consts::TAU * self.uniform())
+        let (sin, cos) = libm::sincosf(std::f32::consts::PI * self.uniform());
+        Quat::from_rotation_arc(Vec3::Z, axis) * Quat::from_xyzw(0.0, 0.0, sin, cos)
     }
 
     /// A random order of 0..n (Fisher–Yates).

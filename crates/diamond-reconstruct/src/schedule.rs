@@ -10,6 +10,8 @@ pub struct StepPlan {
     pub attribute_factor: f32,
     /// Learning rate of the networks.
     pub network_rate: f32,
+    /// Factor on the rate of photographs' gains: 0 outside their window, in it as the Gaussians' attributes.
+    pub exposure_factor: f32,
     /// Added to learned incident light.
     pub incident_offset: f32,
     /// Whether roughness is still the constant 0.5.
@@ -29,7 +31,7 @@ pub struct StepPlan {
 /// Geometric interpolation from `a` to `b`; linear where one of them is 0.
 fn log_lerp(a: f32, b: f32, t: f32) -> f32 {
     let t = t.clamp(0.0, 1.0);
-    if a > 0.0 && b > 0.0 { (a.ln() * (1.0 - t) + b.ln() * t).exp() } else { a * (1.0 - t) + b * t }
+    if a > 0.0 && b > 0.0 { libm::expf(libm::logf(a) * (1.0 - t) + libm::logf(b) * t) } else { a * (1.0 - t) + b * t }
 }
 
 impl StepPlan {
@@ -65,6 +67,10 @@ impl StepPlan {
         Self {
             mean_rate: log_lerp(r.mean, r.mean_final, mean_progress),
             attribute_factor: log_lerp(1.0, r.attribute_final, fraction),
+            exposure_factor: match (config.exposure.from..config.exposure.until).contains(&fraction) {
+                true => log_lerp(1.0, r.attribute_final, fraction),
+                false => 0.0,
+            },
             network_rate: log_lerp(r.network, r.network_final, fraction),
             incident_offset,
             roughness_frozen: fraction < s.roughness_unfreeze,
@@ -97,6 +103,14 @@ mod tests {
             .count() as u64;
         assert_eq!(rounds, expected);
         assert!(StepPlan::new(&config, 10).roughness_frozen && !StepPlan::new(&config, 500).roughness_frozen);
+    }
+
+    #[test]
+    fn gains_have_a_window() {
+        let mut config = Config::preset("resolved").unwrap();
+        config.steps = 1000;
+        let moved: Vec<u64> = (0..1000).filter(|s| StepPlan::new(&config, *s).exposure_factor > 0.0).collect();
+        assert_eq!((moved[0], moved.len(), moved.last()), (100, 300, Some(&399)));
     }
 
     #[test]

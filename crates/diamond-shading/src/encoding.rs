@@ -186,7 +186,7 @@ impl InputScaling {
         match self.scale {
             ScaleInput::Linear => scale,
             ScaleInput::Logarithmic { reference } => {
-                (scale.max(MIN_LENGTH).ln() - reference.max(MIN_LENGTH).ln()) / LOG_SCALE_RANGE
+                (libm::logf(scale.max(MIN_LENGTH)) - libm::logf(reference.max(MIN_LENGTH))) / LOG_SCALE_RANGE
             }
         }
     }

@@ -29,6 +29,7 @@ impl Fresnel {
             }
             Fresnel::SphericalGaussian => {
                 let (linear, quadratic) = SPHERICAL_GAUSSIAN;
+                // tidy: allow(the exponential of diamond-simd)
                 let weight = ((cos_theta_d * (quadratic * LN_2) + linear * LN_2) * cos_theta_d).exp();
                 (weight, weight * LN_2 * (cos_theta_d * (2.0 * quadratic) + linear))
             }

@@ -70,14 +70,16 @@ impl TransferConfig {
     fn activate(&self, x: f32) -> f32 {
         match self.activation {
             TransferActivation::Linear => x,
-            TransferActivation::Softplus { sharpness } => x.max(0.0) + (-sharpness * x.abs()).exp().ln_1p() / sharpness,
+            TransferActivation::Softplus { sharpness } => {
+                x.max(0.0) + libm::log1pf(libm::expf(-sharpness * x.abs())) / sharpness
+            }
         }
     }
 
     fn slope(&self, x: f32) -> f32 {
         match self.activation {
             TransferActivation::Linear => 1.0,
-            TransferActivation::Softplus { sharpness } => 1.0 / (1.0 + (-sharpness * x).exp()),
+            TransferActivation::Softplus { sharpness } => 1.0 / (1.0 + libm::expf(-sharpness * x)),
         }
     }
 }

@@ -58,23 +58,23 @@ pub(crate) const fn coefficients(degree: usize) -> usize {
 
 /// σ in double precision, rounded once.
 pub(crate) fn sigmoid(logit: f32) -> f32 {
-    (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
+    (1.0 / (1.0 + libm::exp(-f64::from(logit)))) as f32
 }
 
 /// The logit of an opacity, within ± [`MAX_LOGIT`].
 pub(crate) fn logit(opacity: f64) -> f32 {
     let o = opacity.clamp(0.0, 1.0);
-    ((o / (1.0 - o)).ln() as f32).clamp(-MAX_LOGIT, MAX_LOGIT)
+    (libm::log(o / (1.0 - o)) as f32).clamp(-MAX_LOGIT, MAX_LOGIT)
 }
 
 /// The logarithm of a scale, within ± [`MAX_LOG_SCALE`].
 pub(crate) fn log_scale(scale: f64) -> f32 {
-    (scale.max(0.0).ln() as f32).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    (libm::log(scale.max(0.0)) as f32).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
 }
 
 /// The scale, in double precision and rounded once; finite whatever the logarithm.
 pub(crate) fn scale(log: f32) -> f32 {
-    f64::from(log.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)).exp() as f32
+    libm::exp(f64::from(log.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))) as f32
 }
 
 /// The unit quaternion; the identity in place of zero.

@@ -22,7 +22,7 @@ pub(crate) fn matrix(rotation: DMat3) -> [[f64; COEFFICIENTS]; COEFFICIENTS] {
     for (z, weight) in NODES {
         let r = (1.0 - z * z).sqrt();
         for step in 0..AROUND {
-            let (sin, cos) = ((step as f64 + 0.5) * std::f64::consts::TAU / AROUND as f64).sin_cos();
+            let (sin, cos) = libm::sincos((step as f64 + 0.5) * std::f64::consts::TAU / AROUND as f64);
             let direction = DVec3::new(r * cos, r * sin, z);
             let here = basis(direction.as_vec3());
             let there = basis((rotation.transpose() * direction).as_vec3());

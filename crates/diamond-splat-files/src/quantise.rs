@@ -46,10 +46,10 @@ pub(crate) fn half(bits: u16) -> f32 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
     let (exponent, fraction) = (i32::from(bits >> 10 & 31), f32::from(bits & 1023) / 1024.0);
     sign * match exponent {
-        0 => fraction * (-14f32).exp2(),
+        0 => fraction * libm::exp2f(-14.0),
         31 if fraction == 0.0 => f32::INFINITY,
         31 => f32::NAN,
-        e => (1.0 + fraction) * ((e - 15) as f32).exp2(),
+        e => (1.0 + fraction) * libm::exp2f((e - 15) as f32),
     }
 }
 

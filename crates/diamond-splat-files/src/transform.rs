@@ -19,7 +19,7 @@ impl SplatCloud {
         for mean in &mut self.means {
             *mean = map.transform_point3(mean.as_dvec3()).as_vec3();
         }
-        let size = a.determinant().abs().cbrt();
+        let size = libm::cbrt(a.determinant().abs());
         let square = a.transpose() * a;
         let similar = size > 0.0
             && (square * (1.0 / (size * size)) - DMat3::IDENTITY).to_cols_array().iter().all(|v| v.abs() < SIMILARITY);
@@ -33,7 +33,7 @@ impl SplatCloud {
                 *rotation = quat((turn * q).normalize());
                 *log += glam::Vec3::splat(log_scale(size));
             } else {
-                let s = log.as_dvec3().exp();
+                let s = log.as_dvec3().map(libm::exp);
                 let m = a * DMat3::from_quat(q) * DMat3::from_diagonal(s);
                 let (values, vectors) = eigen(m * m.transpose());
                 *log = DVec3::from(values.to_array().map(|v| f64::from(log_scale(v.max(0.0).sqrt())))).as_vec3();

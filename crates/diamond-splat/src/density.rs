@@ -240,7 +240,7 @@ pub fn reset_opacity(opacity: f32, ceiling: f32) -> f32 {
 
 /// [`reset_opacity`] on the logit of the opacity, which is what an optimiser holds; `ceiling` in (0, 1) is an opacity.
 pub fn reset_opacity_logit(logit: f32, ceiling: f32) -> f32 {
-    logit.min((ceiling / (1.0 - ceiling)).ln())
+    logit.min(libm::logf(ceiling / (1.0 - ceiling)))
 }
 
 /// Normalised; the identity where that is impossible.

@@ -141,7 +141,7 @@ impl Voxels {
                 for dx in -reach..=reach {
                     let d = Vec3::new(dx as f32, dy as f32, dz as f32);
                     if self.get(at.x + dx, at.y + dy, at.z + dz) {
-                        sum -= d * (-0.5 * d.length_squared() / (NORMAL_SIGMA * NORMAL_SIGMA)).exp();
+                        sum -= d * libm::expf(-0.5 * d.length_squared() / (NORMAL_SIGMA * NORMAL_SIGMA));
                     }
                 }
             }

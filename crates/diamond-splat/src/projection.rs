@@ -244,10 +244,10 @@ fn project_four(g: &Gaussians, four: Four, view: &View, config: &RasterConfig) -
     let inv_sqrt_yy = cov[2].sqrt().recip();
     let inv_sqrt_det = det.sqrt().recip();
     let chol = [cov[2].sqrt() * inv_sqrt_det, -cov[1] * inv_sqrt_yy * inv_sqrt_det, inv_sqrt_yy];
-    let min_alpha_log2 = (config.min_alpha as f64).log2();
+    let min_alpha_log2 = libm::log2(config.min_alpha as f64);
     let mut log2_opacity = Wide::ZERO;
     for k in 0..WIDTH {
-        log2_opacity.0[k] = (g.opacities[four[k]] as f64).log2();
+        log2_opacity.0[k] = libm::log2(g.opacities[four[k]] as f64);
     }
     let tau = (log2_opacity - Wide::of(min_alpha_log2)).clamp(0.0, f64::MAX) * std::f64::consts::LN_2;
     let two_tau = tau * (2.0 * (1.0 + EXTENT_SLACK)) + Wide::of(EXTENT_SLACK);

@@ -24,7 +24,7 @@ pub fn relocated(opacity: f32, copies: u32) -> (f32, f32) {
     }
     let o = f64::from(opacity).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
     // 1 − (1 − o)^(1/N) without cancellation.
-    let each = -((-o).ln_1p() / f64::from(n)).exp_m1();
+    let each = -libm::expm1(libm::log1p(-o) / f64::from(n));
     let (mut sum, mut term) = (0.0, -1.0);
     for k in 1..=n {
         term *= -each * f64::from(n - k + 1) / f64::from(k);

@@ -73,7 +73,7 @@ impl Occluder {
             to_local: Mat3::from_diagonal(inverse) * rotation.transpose(),
             mean,
             opacity,
-            max_q: 2.0 * (opacity / MIN_OCCLUDER_ALPHA).ln(),
+            max_q: 2.0 * libm::logf(opacity / MIN_OCCLUDER_ALPHA),
         }
     }
 }
@@ -420,7 +420,7 @@ impl Visitor for Pass<'_> {
 /// What one occluder takes away, with the fade of [eq:ray-transmittance].
 #[inline]
 fn occluder_alpha(opacity: f32, q: f32) -> f32 {
-    let alpha = (opacity * (-0.5 * q).exp()).min(MAX_OCCLUDER_ALPHA);
+    let alpha = (opacity * libm::expf(-0.5 * q)).min(MAX_OCCLUDER_ALPHA);
     alpha * (alpha / MIN_OCCLUDER_ALPHA - 1.0).clamp(0.0, 1.0)
 }
 

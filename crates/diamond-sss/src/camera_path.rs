@@ -64,7 +64,7 @@ fn camera_of(path: &Path, index: usize, frame: &Value, shared: &Value) -> Result
     let (width, height) = (need(&["width", "w"])?, need(&["height", "h"])?);
     let focal = match get(&["fl_x"]) {
         Some(f) => f,
-        None => 0.5 * width / (0.5 * need(&["camera_angle_x", "fl_x"])?).tan(),
+        None => 0.5 * width / libm::tan(0.5 * need(&["camera_angle_x", "fl_x"])?),
     };
     let matrix = frame
         .get("transform_matrix")

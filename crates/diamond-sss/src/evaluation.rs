@@ -4,11 +4,15 @@
 //! peak 1 over all pixels and channels; SSIM with an 11×11 window, zero-padded; FLIP for low dynamic range at 67 pixels
 //! per degree. *Masked* means inside the photograph's mask, that is where coverage exceeds ½. A light is *seen* where it
 //! coincides with a light of the training selection.
+//!
+//! A held-out photograph whose exposure is not known by itself is compared as the model renders it: under the global gain
+//! if one was learned, else under gain 1, which is the geometric mean of the learned exposures. Where gains belong to views
+//! or images, the gain that would have fitted each photograph best is reported beside it, and the PSNR under that one.
 use crate::{AtOnce, SssError, render_lights};
 use diamond_dataset::{Capture, to_display};
 use diamond_image::{Image, Mask};
 use diamond_metrics::{FlipOptions, SsimWindow, flip_ldr, psnr, psnr_masked, ssim};
-use diamond_reconstruct::Model;
+use diamond_reconstruct::{ExposureMode, Model, fitted_gain};
 
 /// PSNR of identical images is infinite, which JSON cannot say and no mean survives; it is reported as this, dB. Two
 /// different 8-bit images of fewer than 3·10⁹ values are never as close.
@@ -42,6 +46,57 @@ pub struct ImageScore {
     pub all: Scored,
     /// Inside the mask; `None` without a mask or where it is empty.
     pub masked: Option<Scored>,
+    /// Where gains belong to views or images: the gain that fits this photograph best.
+    pub fitted: Option<FittedGain>,
+}
+
+/// What a gain of its own would do for a held-out photograph.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FittedGain {
+    /// Factors on linear red, green and blue (equal unless gains are per channel).
+    pub gain: [f32; 3],
+    /// PSNR over all pixels under it, dB, at most [`PSNR_CAP`].
+    pub psnr: f64,
+}
+
+/// The gain under which held-out photographs are compared.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum HeldOutGain {
+    /// Exposure is fixed: what the model renders.
+    None,
+    /// The learned global one: linear red, green, blue.
+    Global([f32; 3]),
+    /// 1, the geometric mean of the gains of views or images.
+    Mean,
+}
+
+impl HeldOutGain {
+    /// That of a model.
+    pub fn of(model: &Model) -> Self {
+        match model.config.exposure.mode {
+            ExposureMode::Fixed => HeldOutGain::None,
+            mode @ ExposureMode::Global => HeldOutGain::Global(model.exposure.of_renderings(mode).to_array()),
+            ExposureMode::PerView | ExposureMode::PerImage => HeldOutGain::Mean,
+        }
+    }
+
+    /// As in `metrics.json`.
+    pub fn name(self) -> &'static str {
+        match self {
+            HeldOutGain::None => "none",
+            HeldOutGain::Global(_) => "global",
+            HeldOutGain::Mean => "mean",
+        }
+    }
+
+    /// In words.
+    pub fn sentence(self) -> String {
+        match self {
+            HeldOutGain::None => "none, exposure is fixed".into(),
+            HeldOutGain::Global([r, g, b]) => format!("the learned global one, {r:.4} {g:.4} {b:.4}"),
+            HeldOutGain::Mean => "1, the geometric mean of the learned gains".into(),
+        }
+    }
 }
 
 /// What was compared, for whoever wants to keep the pictures.
@@ -98,6 +153,20 @@ pub(crate) fn evaluate_with(
                 }),
                 None => None,
             };
+            let fitted = match HeldOutGain::of(model) {
+                HeldOutGain::Mean => {
+                    let per_channel = model.config.exposure.per_channel;
+                    let gain = fitted_gain(&picture, &observation.radiance, observation.mask.as_ref(), per_channel)
+                        .map(|g| g.unwrap_or(1.0));
+                    let mut exposed = picture.clone();
+                    for pixel in exposed.data_mut().chunks_exact_mut(3) {
+                        pixel.iter_mut().zip(gain).for_each(|(v, g)| *v *= g);
+                    }
+                    let psnr = psnr(&as_image(&to_display(&exposed))?, &truth, 1.0)?.min(PSNR_CAP);
+                    Some(FittedGain { gain, psnr })
+                }
+                _ => None,
+            };
             let score = ImageScore {
                 name: shot.name.clone(),
                 view: v,
@@ -106,6 +175,7 @@ pub(crate) fn evaluate_with(
                 seen_light: capture.is_seen_light(&shot.light),
                 all,
                 masked,
+                fitted,
             };
             each(
                 scores.len() + 1,

@@ -37,7 +37,7 @@ mod training_log;
 pub use camera_path::{CameraChoice, cameras_of, parse_cameras, read_cameras};
 pub use capture_check::open_capture;
 pub use error::SssError;
-pub use evaluation::{ImageScore, PSNR_CAP, Scored, evaluate_model};
+pub use evaluation::{FittedGain, HeldOutGain, ImageScore, PSNR_CAP, Scored, evaluate_model};
 pub use export::{ExportOptions, Exported, convert_splats, export_model, is_splat_file, parse_turn};
 pub use inspect::{inspect_picture, inspect_text};
 pub use light_choice::{LightChoice, LightMix, parse_mix, parse_vec3};

@@ -3,7 +3,7 @@ use crate::capture_check::open_capture;
 use crate::evaluation::{Compared, evaluate_with};
 use crate::output_file::write_json;
 use crate::picture::{encode_png_rgb, heat_bytes};
-use crate::{ImageScore, PSNR_CAP, RunRecord, Scored, SssError, write_output};
+use crate::{HeldOutGain, ImageScore, PSNR_CAP, RunRecord, Scored, SssError, write_output};
 use diamond_dataset::{Capture, DatasetError, Selection};
 use diamond_reconstruct::Model;
 use serde_json::{Map, Value, json};
@@ -62,6 +62,8 @@ pub struct Metrics {
     pub steps: u64,
     /// Gaussians of the model.
     pub gaussians: usize,
+    /// Under which gain held-out images were compared.
+    pub gain: HeldOutGain,
     /// Hash of the capture that was learned from, where it is known and another.
     pub trained_on: Option<String>,
 }
@@ -70,6 +72,21 @@ impl Metrics {
     /// Summary of the images that `keep` keeps, over all pixels or inside the masks.
     pub fn summary(&self, masked: bool, keep: impl Fn(&ImageScore) -> bool) -> Option<Summary> {
         Summary::of(self.scores.iter().filter(|s| keep(s)).filter_map(|s| if masked { s.masked } else { Some(s.all) }))
+    }
+
+    /// Mean PSNR, dB, of the images that `keep` keeps, each under the gain that fits it best; `None` where that is not
+    /// measured.
+    pub fn fitted_psnr(&self, keep: impl Fn(&ImageScore) -> bool) -> Option<f64> {
+        let all: Vec<f64> = self.scores.iter().filter(|s| keep(s)).filter_map(|s| s.fitted.map(|f| f.psnr)).collect();
+        (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
+    }
+
+    /// Under which gain held-out images were compared, and what a gain of their own would change, in words.
+    pub fn gain_sentence(&self) -> String {
+        let fitted = self
+            .fitted_psnr(|_| true)
+            .map_or(String::new(), |psnr| format!("; {psnr:.2} dB with the gain that fits each image best"));
+        format!("{}{fitted}", self.gain.sentence())
     }
 
     fn group(
@@ -82,6 +99,9 @@ impl Metrics {
         let inner = if path.is_empty() { "masked".to_owned() } else { format!("{path}.masked") };
         let masked = self.values(&inner, self.summary(true, keep), self.reason(keep, true), absent);
         out.insert("masked".into(), Value::Object(masked));
+        if let Some(psnr) = self.fitted_psnr(keep) {
+            out.insert("psnr_fitted_gain".into(), psnr.into());
+        }
         out
     }
 
@@ -154,6 +174,10 @@ impl Metrics {
         if let Some(hash) = &self.trained_on {
             out.insert("trained_on_capture_hash".into(), hash.clone().into());
         }
+        out.insert("gain".into(), self.gain.name().into());
+        if let HeldOutGain::Global(gain) = self.gain {
+            out.insert("global_gain".into(), json!(gain));
+        }
         out.insert("absent".into(), absent.into());
         out.insert(
             "protocol".into(),
@@ -165,6 +189,9 @@ impl Metrics {
                 "flip": "LDR-FLIP, 67 pixels per degree, mean",
                 "masked": "pixels whose coverage exceeds 0.5",
                 "seen_lights": "lights within half a degree of a training light",
+                "gain": "of renderings before comparison: none, global (the learned one), or mean (1, the geometric mean \
+                         of the learned gains of views or images)",
+                "psnr_fitted_gain": "each image under the gain that fits it best: the weighted median ratio of photograph and rendering",
                 "std": "standard deviation over images",
             }),
         );
@@ -179,6 +206,10 @@ impl Metrics {
                 row["seen_light"] = s.seen_light.into();
                 row["resolution"] = json!([s.size.0, s.size.1]);
                 row["masked"] = s.masked.as_ref().map(part).into();
+                if let Some(fitted) = s.fitted {
+                    row["fitted_gain"] = json!(fitted.gain);
+                    row["psnr_fitted_gain"] = fitted.psnr.into();
+                }
                 row
             })
             .collect();
@@ -223,6 +254,7 @@ impl Metrics {
                 }
             }
         }
+        out += &format!("Gain of held-out images: {}\n", self.gain_sentence());
         out
     }
 
@@ -268,6 +300,7 @@ pub fn evaluate_folder(
         preset: record.map_or(model.config.name.clone(), |r| r.preset),
         steps: model.config.steps,
         gaussians: model.len(),
+        gain: HeldOutGain::of(&model),
         trained_on,
     };
     metrics.write(folder)?;
@@ -298,6 +331,7 @@ mod tests {
             preset: "resolved".into(),
             steps: 10,
             gaussians: 5,
+            gain: HeldOutGain::Mean,
             trained_on: None,
         }
     }
@@ -305,11 +339,21 @@ mod tests {
     #[test]
     fn what_is_absent_is_null_and_says_why() {
         let one = Scored { psnr: PSNR_CAP, ssim: 1.0, flip: 0.0 };
-        let score =
-            ImageScore { name: "a".into(), view: 0, shot: 0, size: (8, 4), seen_light: true, all: one, masked: None };
+        let score = ImageScore {
+            name: "a".into(),
+            view: 0,
+            shot: 0,
+            size: (8, 4),
+            seen_light: true,
+            all: one,
+            masked: None,
+            fitted: Some(crate::FittedGain { gain: [2.0; 3], psnr: 40.0 }),
+        };
         let json = metrics(vec![score]).to_json();
         assert_eq!(json["psnr"], 150.0);
         assert_eq!(json["resolution"], json!([8, 4]));
+        assert_eq!((&json["gain"], &json["psnr_fitted_gain"]), (&json!("mean"), &json!(40.0)));
+        assert_eq!(json["per_image"][0]["fitted_gain"], json!([2.0, 2.0, 2.0]));
         assert_eq!(json["seen_lights"]["ssim"], 1.0);
         for (value, key) in [
             (&json["unseen_lights"]["psnr"], "unseen_lights.psnr"),

@@ -359,6 +359,7 @@ fn run(
         preset: options.preset.clone(),
         steps: config.steps,
         gaussians: model.len(),
+        gain: crate::HeldOutGain::of(model),
         trained_on: None,
     };
     metrics.write(folder)?;

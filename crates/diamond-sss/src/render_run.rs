@@ -61,7 +61,7 @@ pub fn render_folder(
                 _ => format!("{camera}_{light}.{extension}"),
             })
         };
-        let gain = options.exposure.exp2();
+        let gain = libm::exp2f(options.exposure);
         let exposed = if gain == 1.0 { picture.clone() } else { picture.map(|v| v * gain) };
         let bytes = if options.linear { encode_exr(&exposed)? } else { encode_png_linear(&exposed)? };
         write_output(&path, &bytes)?;

@@ -31,7 +31,7 @@ pub fn splat_picture(cloud: &SplatCloud) -> Result<(usize, usize, Vec<u8>), SssE
     let (low, high) = summary.core.unwrap_or((Vec3::ZERO, Vec3::ONE));
     let centre = 0.5 * (low + high);
     let radius = (0.5 * (high - low).length()).max(1e-3);
-    let distance = 1.2 * radius / (0.5 * FIELD).tan();
+    let distance = 1.2 * radius / libm::tanf(0.5 * FIELD);
     let config = RasterConfig { near: (0.01 * distance).max(1e-6), ..RasterConfig::default() };
     let side = SIDE as usize;
     let mut out = vec![0; 3 * side * side * 3];

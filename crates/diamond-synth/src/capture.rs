@@ -230,7 +230,8 @@ impl Job<'_> {
             lights.sort_unstable();
             lights.truncate(LIGHTS_PER_SOLUTION);
             let (points, walks) = EXPOSURE_EFFORT;
-            let options = BulkOptions { points, walks, samples_per_axis: 1, ..self.options(self.recipe.seed ^ EXPOSED) };
+            let options =
+                BulkOptions { points, walks, samples_per_axis: 1, ..self.options(self.recipe.seed ^ EXPOSED) };
             let scene = self.scene(&lights);
             let bulk = Bulk::solve(&scene, &options, &|f| (self.progress)(Stage::Exposure, f))?;
             let picture = bulk.render(&resized(&view.camera, EXPOSURE_SIDE), self.recipe.seed)?;
@@ -253,8 +254,7 @@ impl Job<'_> {
         let cameras: Vec<Camera> = spread(views.len(), MEASURED_VIEWS)
             .map(|k| resized(&views[k].camera, MEASURED_SIDE.min(self.recipe.film.resolution)))
             .collect();
-        let lights: Vec<usize> =
-            spread(views[0].lights.len(), MEASURED_LIGHTS).map(|k| views[0].lights[k]).collect();
+        let lights: Vec<usize> = spread(views[0].lights.len(), MEASURED_LIGHTS).map(|k| views[0].lights[k]).collect();
         let reference = ReferenceOptions {
             samples: MEASURED_PATHS,
             seed: self.recipe.seed ^ MEASURED,
@@ -275,7 +275,8 @@ impl Job<'_> {
                 ),
             })
         });
-        let lights: Vec<Value> = self.plan.lights.iter().filter_map(OlatLight::position).map(|p| json!(p.to_array())).collect();
+        let lights: Vec<Value> =
+            self.plan.lights.iter().filter_map(OlatLight::position).map(|p| json!(p.to_array())).collect();
         json!({
             "renderer": concat!("diamond-pathtrace ", env!("CARGO_PKG_VERSION"), ", bulk"),
             "recipe": serde_json::to_value(self.recipe).unwrap_or_default(),

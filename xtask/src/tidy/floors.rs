@@ -73,7 +73,7 @@ const SIMD_AND_GLAM: &[&str] = &[
 ];
 
 const fn light(name: &'static str, floor: u8, outside: &'static [&'static str]) -> Package {
-    Package { name, floor, outside: Some(outside), optional: &[], alone: Some(&["glam"]) }
+    Package { name, floor, outside: Some(outside), optional: &[], alone: Some(&["glam", "libm"]) }
 }
 
 const fn heavy(name: &'static str, floor: u8, outside: &'static [&'static str]) -> Package {
@@ -82,30 +82,26 @@ const fn heavy(name: &'static str, floor: u8, outside: &'static [&'static str]) 
 
 /// Every package of the workspace; the same table as in docs/architecture.md.
 pub const PACKAGES: &[Package] = &[
-    Package { name: "diamond-image", floor: 0, outside: Some(&[]), optional: &[], alone: Some(&[]) },
-    light("diamond-camera", 0, &["glam"]),
-    light("diamond-light", 0, &["glam"]),
+    Package { name: "diamond-image", floor: 0, outside: Some(&["libm"]), optional: &[], alone: Some(&["libm"]) },
+    light("diamond-camera", 0, &["glam", "libm"]),
+    light("diamond-light", 0, &["glam", "libm"]),
     Package { name: "diamond-simd", floor: 0, outside: Some(&["pulp"]), optional: &[], alone: Some(SIMD) },
     heavy(TESTKIT, 0, &["proptest"]),
-    heavy("diamond-splat", 1, &["glam", "rayon"]),
+    heavy("diamond-splat", 1, &["glam", "rayon", "libm"]),
     Package {
         name: "diamond-shading",
         floor: 1,
-        outside: Some(&["glam"]),
+        outside: Some(&["glam", "libm"]),
         optional: &["rayon"],
         alone: Some(SIMD_AND_GLAM),
     },
-    Package { name: "diamond-metrics", floor: 1, outside: Some(&[]), optional: &["rayon"], alone: Some(SIMD) },
-    heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2"]),
-    Package { name: "diamond-losses", floor: 2, outside: Some(&[]), optional: &[], alone: Some(SIMD) },
+    Package { name: "diamond-metrics", floor: 1, outside: Some(&["libm"]), optional: &["rayon"], alone: Some(SIMD) },
+    heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2", "libm"]),
+    Package { name: "diamond-losses", floor: 2, outside: Some(&["libm"]), optional: &[], alone: Some(SIMD) },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
-    heavy(
-        "diamond-synth",
-        3,
-        &["glam", "rayon", "serde", "serde_json", "toml", "sha2"],
-    ),
-    heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd"]),
-    heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2"]),
+    heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2"]),
+    heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
+    heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
     heavy(
         "diamond-sss",
         5,
@@ -124,6 +120,7 @@ pub const PACKAGES: &[Package] = &[
             "base64",
             "ctrlc",
             "signal-hook",
+            "libm",
         ],
     ),
     Package { name: "xtask", floor: 6, outside: None, optional: &[], alone: None },

@@ -15,6 +15,36 @@ const PANICS: &[&str] =
 /// What prints or exits.
 const PRINTS: &[&str] = &["print!(", "println!(", "dbg!(", "process::exit", "process::abort", "stdout()", "stderr()"];
 
+/// Methods of floating-point numbers whose last bits are the platform's.
+const PLATFORM_METHODS: &[&str] = &[
+    "exp", "exp2", "exp_m1", "ln", "ln_1p", "log", "log2", "log10", "powf", "sin", "cos", "sin_cos", "tan", "asin",
+    "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "cbrt", "hypot",
+];
+
+/// Functions of glam that call them.
+const PLATFORM_ROTATIONS: &[&str] = &[
+    "from_rotation_x",
+    "from_rotation_y",
+    "from_rotation_z",
+    "from_axis_angle",
+    "from_scaled_axis",
+    "from_euler",
+    "from_angle",
+    "slerp",
+    "angle_between",
+    "to_axis_angle",
+    "to_euler",
+];
+
+/// What neither trains nor renders a model: it may draw, print and trace ground truth with the platform's last bits.
+const DRAWN: &[&str] = &[
+    "crates/diamond-pathtrace/",
+    "crates/diamond-synth/",
+    "crates/diamond-sss/src/inspect/",
+    "crates/diamond-sss/src/report/",
+    "crates/diamond-sss/src/export.rs",
+];
+
 /// Folders of somebody's machine, in two halves so that this file does not break its own rule.
 const MACHINE_PATHS: &[&str] = &[
     concat!("/wo", "rk/"),
@@ -123,6 +153,37 @@ pub fn no_print(tree: &Tree) -> Violations {
         for (line, code) in source.shipped_code() {
             if let Some(what) = PRINTS.iter().find(|what| code.contains(**what)) {
                 found.push(at(source, line, format!("`{what}` below floor {PROGRAM_FLOOR}: return a value instead")));
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Whether a line of code calls a method, or names a function of a number or vector, whose last bits are the platform's.
+fn platform_call(code: &str) -> Option<&'static str> {
+    let called = |name: &&&str| {
+        let method = code.contains(&format!(".{name}("));
+        let path = code.match_indices(&format!("::{name}")).any(|(start, found)| {
+            let whole = !code[start + found.len()..].starts_with(|c: char| c.is_alphanumeric() || c == '_');
+            let owner = code[..start].rsplit(|c: char| !c.is_alphanumeric()).next().unwrap_or_default();
+            whole && (matches!(owner, "f32" | "f64" | "Vec2" | "Vec3" | "Vec3A" | "Vec4" | "DVec2" | "DVec3" | "DVec4"))
+        });
+        method || path
+    };
+    let rotation = |name: &&&str| ["::", "."].iter().any(|before| code.contains(&format!("{before}{name}(")));
+    PLATFORM_METHODS.iter().find(called).or_else(|| PLATFORM_ROTATIONS.iter().find(rotation)).copied()
+}
+
+/// What trains or renders takes elementary functions from `libm` or `diamond-simd`.
+pub fn same_bits(tree: &Tree) -> Violations {
+    let mut found = Vec::new();
+    let ours = |source: &&Source| {
+        source.path.starts_with("crates/") && !DRAWN.iter().any(|folder| source.path.starts_with(folder))
+    };
+    for source in shipped(tree).filter(ours) {
+        for (line, code) in source.shipped_code() {
+            if let Some(what) = platform_call(code) {
+                found.push(at(source, line, format!("`{what}` has the platform's last bits: use libm's")));
             }
         }
     }

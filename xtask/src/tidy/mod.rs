@@ -100,6 +100,11 @@ pub const RULES: &[Rule] = &[
     ),
     rule("no-print", "only the program prints or exits; a library that does cannot be embedded", house::no_print),
     rule(
+        "same-bits",
+        "the standard library's exponentials and angles have the platform's last bits; libm's are the same everywhere",
+        house::same_bits,
+    ),
+    rule(
         "stands-alone",
         "the repository works from any clone: it names no folder of anybody's machine",
         house::stands_alone,

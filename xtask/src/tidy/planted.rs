@@ -148,6 +148,13 @@ const CASES: &[Case] = &[
     ("no-panic", "todo", |t| t.append(SHADING, "fn f() {\n    todo!()\n}\n")),
     ("no-print", "printing", |t| t.append(SHADING, "fn f() {\n    eprintln!(\"x\");\n}\n")),
     ("no-print", "exiting", |t| t.append(SHADING, "fn f() {\n    std::process::exit(1);\n}\n")),
+    ("same-bits", "an exponential of the platform", |t| {
+        t.append(SHADING, "/// F.\npub fn f(x: f32) -> f32 {\n    x.exp()\n}\n")
+    }),
+    ("same-bits", "a logarithm by its path", |t| {
+        t.append(SHADING, "fn f(x: Option<f32>) -> Option<f32> {\n    x.map(f32::ln)\n}\n")
+    }),
+    ("same-bits", "a rotation", |t| t.append(SHADING, "fn f() -> Quat {\n    Quat::from_rotation_z(1.0)\n}\n")),
     ("stands-alone", "a machine's folder", |t| {
         t.write("docs/testing.md", &format!("Look into {}scratch.\n", concat!("/t", "mp/")))
     }),

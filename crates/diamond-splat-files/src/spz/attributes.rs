@@ -25,7 +25,7 @@ const SMALLEST: f64 = 511.0;
 /// coordinate, at least the customary 12 where these fit.
 pub(super) fn fractional_bits(cloud: &SplatCloud) -> Result<u32, SplatFileError> {
     let largest = cloud.means.iter().map(|m| f64::from(m.abs().max_element())).fold(0.0, f64::max);
-    let fits = |bits: u32| largest * f64::from(bits).exp2() <= MAX_FIXED;
+    let fits = |bits: u32| largest * libm::exp2(f64::from(bits)) <= MAX_FIXED;
     if !fits(0) {
         let found = format!("{largest}");
         return Err(malformed(
@@ -37,7 +37,7 @@ pub(super) fn fractional_bits(cloud: &SplatCloud) -> Result<u32, SplatFileError>
         ));
     }
     let mut bits = 0;
-    while bits < 23 && fits(bits + 1) && (bits < USUAL_BITS || largest * f64::from(bits).exp2() < WANTED_STEPS) {
+    while bits < 23 && fits(bits + 1) && (bits < USUAL_BITS || largest * libm::exp2(f64::from(bits)) < WANTED_STEPS) {
         bits += 1;
     }
     Ok(if largest == 0.0 { USUAL_BITS } else { bits })
@@ -60,7 +60,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<SplatCloud, SplatFi
     let degree = header.degree.min(MAX_DEGREE);
     let (width, stored) = (coefficients(degree), coefficients(header.degree) - 1);
     let mut cloud = SplatCloud::zeros(n, degree);
-    let step = (-f64::from(header.fractional_bits)).exp2();
+    let step = libm::exp2(-f64::from(header.fractional_bits));
     for i in 0..n {
         let p = &positions[i * widths[0]..(i + 1) * widths[0]];
         cloud.means[i] = Vec3::from(std::array::from_fn(|k| match header.version {
@@ -121,7 +121,7 @@ pub(super) fn encode(header: &Header, cloud: &SplatCloud) -> [Vec<u8>; 6] {
     let n = cloud.len();
     let mut streams = header.widths().map(|width| Vec::with_capacity(width * n));
     let [positions, alphas, colors, scales, rotations, harmonics] = &mut streams;
-    let steps = f64::from(header.fractional_bits).exp2();
+    let steps = libm::exp2(f64::from(header.fractional_bits));
     let width = cloud.coefficients();
     for i in 0..n {
         for v in cloud.means[i].to_array() {

@@ -162,7 +162,7 @@ impl SplatPly {
             scales: self
                 .log_scales
                 .iter()
-                .map(|s| s.clamp(Vec3::splat(-MAX_LOG_SCALE), Vec3::splat(MAX_LOG_SCALE)).exp())
+                .map(|s| s.clamp(Vec3::splat(-MAX_LOG_SCALE), Vec3::splat(MAX_LOG_SCALE)).map(libm::expf))
                 .collect(),
             rotations: self.rotations.clone(),
             opacities: self.opacity_logits.iter().map(|&v| sigmoid(v)).collect(),
@@ -174,9 +174,9 @@ impl SplatPly {
     pub fn from_gaussians(gaussians: &Gaussians) -> Self {
         let logit = |o: f32| {
             let o = o.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-            (o / (1.0 - o)).ln()
+            libm::logf(o / (1.0 - o))
         };
-        let log = |s: f32| s.max(0.0).ln().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE);
+        let log = |s: f32| libm::logf(s.max(0.0)).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE);
         Self {
             means: gaussians.means.clone(),
             opacity_logits: gaussians.opacities.iter().map(|&o| logit(o)).collect(),
@@ -197,5 +197,5 @@ impl SplatPly {
 }
 
 fn sigmoid(v: f32) -> f32 {
-    1.0 / (1.0 + (-v).exp())
+    1.0 / (1.0 + libm::expf(-v))
 }

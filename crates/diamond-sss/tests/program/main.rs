@@ -5,6 +5,7 @@ mod captures;
 mod changed_capture;
 #[cfg(unix)]
 mod disk;
+mod exposure;
 mod killed;
 #[cfg(unix)]
 mod memory_limit;
