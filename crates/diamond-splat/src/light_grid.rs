@@ -425,7 +425,7 @@ impl LightGrid {
             }
             (low, high) = (low.min(o.mean), high.max(o.mean));
             occluders.push(i as u32);
-            opacity.push([o.opacity.log2(), o.max_q]);
+            opacity.push([libm::log2f(o.opacity), o.max_q]);
             let rotation = Mat3::from_quat(unit_rotation(gaussians.rotations[i]));
             let axes = rotation * Mat3::from_diagonal(thickened(gaussians.scales[i]) * o.max_q.sqrt());
             let local = o.to_local.to_cols_array();
