@@ -25,6 +25,7 @@
 //! # Ok::<(), diamond_pathtrace::PathtraceError>(())
 //! ```
 mod boundary;
+mod bulk;
 mod clearance;
 pub mod closed_form;
 mod coat;
@@ -54,6 +55,7 @@ mod scene;
 mod triangle;
 
 pub use boundary::{Boundary, BoundarySample};
+pub use bulk::{Bulk, BulkError, BulkOptions, BulkView, measure_bulk};
 pub use coat::Coat;
 pub use distance_field::{DistanceField, Operation, Solid, SurfaceNoise, smooth_minimum};
 pub use environment::{Environment, EnvironmentMap};

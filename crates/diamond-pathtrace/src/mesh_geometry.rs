@@ -184,6 +184,16 @@ impl MeshGeometry {
         })
     }
 
+    /// The triangles that an endless ray crosses, in no order.
+    pub(crate) fn each_crossing(&self, origin: Vec3, direction: Vec3, mut visit: impl FnMut(u32)) {
+        let Some((sheared, ray)) = self.prepared(origin, direction, f32::INFINITY) else { return };
+        self.bvh.ray_traverse_anyhit(ray, |_, slot| {
+            if sheared.intersect(&self.corners[slot]).is_some() {
+                visit(self.bvh.primitive_indices[slot]);
+            }
+        });
+    }
+
     /// All crossings of a ray, summed up, in one traversal without order.
     #[inline]
     pub(crate) fn crossings(&self, origin: Vec3, direction: Vec3, max: f32, skip: u32) -> Crossing {
