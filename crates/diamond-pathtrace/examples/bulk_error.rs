@@ -152,7 +152,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 bulk.points(),
                 bulk.bytes() as f32 / 1e6,
                 100.0 * e.bias,
-                100.0 * e.bias_standard_error,
+                100.0 * e.bias_standard_error.hypot(e.bias_noise),
                 100.0 * e.rmse,
                 100.0 * e.rmse_of_rms,
                 100.0 * e.noise,

@@ -154,7 +154,7 @@ impl<'a> Bulk<'a> {
         let total = points.points().len();
         let told = |row: Vec<f32>| {
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
-            if n % 64 == 0 || n == total {
+            if n.is_multiple_of(64) || n == total {
                 progress(n as f32 / total as f32);
             }
             row

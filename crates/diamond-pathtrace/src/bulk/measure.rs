@@ -11,6 +11,9 @@ pub struct BulkError {
     pub bias: f64,
     /// Standard error of `bias` that the reference's noise makes, lamps taken as fully correlated.
     pub bias_standard_error: f64,
+    /// What two solutions with half the walks differ by in the mean, halved: the size of the bulk solution's own part in `bias`
+    /// (walks are shared by all pixels and lamps, so it does not average out over them).
+    pub bias_noise: f64,
     /// Root of the mean squared difference from the reference, without the reference's own noise, over the mean radiance.
     pub rmse: f64,
     /// The same over the root mean square of the reference.
@@ -83,7 +86,7 @@ impl BulkError {
         let second = Bulk::solve(scene, &halved(options.seed.wrapping_add(2)), &|f| progress(0.75 + f * 0.25))?;
         let (mut sum, mut reference_sum, mut reference_square) = (0.0f64, 0.0f64, 0.0f64);
         let (mut squares, mut own, mut noise, mut relative, mut n) = (0.0f64, 0.0f64, 0.0f64, 0.0f64, 0usize);
-        let mut spread = 0.0f64;
+        let (mut spread, mut apart) = (0.0f64, 0.0f64);
         let mut pictures = 0usize;
         for (v, (camera, reference)) in cameras.iter().zip(references).enumerate() {
             let view = whole.render(camera, v as u64)?;
@@ -108,6 +111,7 @@ impl BulkError {
                         squares += (x - r) * (x - r);
                         own += e * e;
                         pixel_error[i] += e;
+                        apart += half;
                         // Var(a − b) = 2·Var(half) = 4·Var(whole).
                         here += 0.25 * half * half;
                         here_n += 1;
@@ -127,6 +131,7 @@ impl BulkError {
         Ok(Self {
             bias: sum / reference_sum.max(1e-30) - 1.0,
             bias_standard_error: spread.sqrt() / reference_sum.max(1e-30),
+            bias_noise: 0.5 * apart.abs() / reference_sum.max(1e-30),
             rmse: error / mean,
             rmse_of_rms: error / rms,
             noise: (noise / n).sqrt() / mean,

@@ -1,6 +1,6 @@
 //! One view under all lamps: camera rays, stored light, single scattering, reflections.
 use super::directions::{CONE, HEMISPHERE, HEMISPHERE_MEAN, basis, carried};
-use super::matched::forced_flight;
+use super::matched::forced_flight_quantile;
 use super::refracting::Cone;
 use super::{Bulk, Stored};
 use crate::geometry::Facing;
@@ -23,13 +23,14 @@ const REFLECTIONS: u32 = 16;
 /// Pixels on outlines get this many times more samples per axis.
 const EDGE: u32 = 3;
 
-/// Irrational steps of a two-dimensional low-discrepancy sequence (Roberts 2018): powers of the plastic number.
-const STEPS: Vec2 = Vec2::new(0.754_877_7, 0.569_840_3);
+/// The golden ratio's fractional part: its multiples fill the unit interval evenly, however many there are.
+const STEP: f32 = 0.618_034;
 
 /// Pictures of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BulkView {
-    /// Linear RGB radiance under each lamp, black where no object is (premultiplied by coverage).
+    /// Linear RGB radiance under each lamp, black where no object is (premultiplied by coverage). Noise may
+    /// leave values slightly below 0 where there is hardly any light: cutting them off would brighten the mean.
     pub lights: Vec<Image>,
     /// Fraction of each pixel that the object covers.
     pub coverage: Image,
@@ -66,7 +67,7 @@ struct Gather<'a, const N: usize> {
     /// For each channel, each light.
     values: Vec<f32>,
     rng: Rng,
-    sequence: Vec2,
+    sequence: f32,
 }
 
 impl Bulk<'_> {
@@ -112,8 +113,7 @@ impl Bulk<'_> {
             for (l, image) in view.lights.iter_mut().enumerate() {
                 let colour = self.lamps.colour(l);
                 for c in 0..3 {
-                    // Least squares may overshoot below zero where light is none.
-                    image.data_mut()[3 * i + c] = (pixel.values[c * lights + l] * colour[c]).max(0.0);
+                    image.data_mut()[3 * i + c] = pixel.values[c * lights + l] * colour[c];
                 }
             }
             view.coverage.data_mut()[i] = pixel.coverage;
@@ -126,7 +126,7 @@ impl Bulk<'_> {
 
 impl<'a, const N: usize> Gather<'a, N> {
     fn new(bulk: &'a Bulk<'a>, mut rng: Rng) -> Self {
-        let sequence = Vec2::new(rng.uniform(), rng.uniform());
+        let sequence = rng.uniform();
         let values = vec![0.0; 3 * bulk.lamps.len()];
         Self { bulk, wanted: Vec::new(), weights: Vec::new(), values, rng, sequence }
     }
@@ -260,15 +260,14 @@ impl Gather<'_, HEMISPHERE> {
         self.weights = weights;
     }
 
-    /// Light that was scattered once, at a random place of the stretch.
+    /// Light that was scattered once, at one place of the stretch.
     /// `[eq:single-scattering]`
     fn once(&mut self, hit: &Hit, direction: Vec3, length: f32, weight: Vec3) {
         let bulk = self.bulk;
         let medium = bulk.scene.material.medium;
-        self.sequence += STEPS;
+        self.sequence += STEP;
         self.sequence -= self.sequence.floor();
-        let channel = ((self.sequence.y * 3.0) as usize).min(2);
-        let (distance, ratio) = forced_flight(medium.sigma_t, length, channel, self.sequence.x);
+        let (distance, ratio) = forced_flight_quantile(medium.sigma_t, length, self.sequence);
         let at = hit.position + direction * distance;
         let weight = weight * ratio * medium.albedo;
         for l in 0..bulk.lamps.len() {
