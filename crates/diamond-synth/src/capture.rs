@@ -24,7 +24,7 @@ use std::path::Path;
 const LIGHTS_PER_SOLUTION: usize = 128;
 /// Seeds of held-out images, of the measurement, of the exposure and of points are the recipe's with these bits turned.
 const HELD_OUT: u64 = 0x7465_7374;
-const MEASURED: u64 = 0x6572_726f_72;
+const MEASURED: u64 = 0x0065_7272_6f72;
 const EXPOSED: u64 = 0x6578_706f;
 /// Points and walks of the solution that finds the exposure.
 const EXPOSURE_EFFORT: (u32, u32) = (1000, 64);
