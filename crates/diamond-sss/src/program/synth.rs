@@ -2,7 +2,7 @@
 use super::progress::Counter;
 use super::{complain, print};
 use diamond_sss::SssError;
-use diamond_synth::{CaptureRecord, Family, Progress, Recipe, Stage, SynthError, synthesize};
+use diamond_synth::{CaptureRecord, Family, Progress, Recipe, Stage, synthesize};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
