@@ -17,6 +17,7 @@ pub(crate) const HEMISPHERE_MEAN: f32 = 2.0 / 3.0;
 
 /// A direction relative to a frame: 1, μ − m, t₁, t₂, μ² − ½, t₁² − t₂², t₁t₂, μt₁, μt₂ with μ = cos of the angle to the normal, at least 0,
 /// and its mean m over the directions in question: all but the first are 0 in the mean.
+/// `[eq:direction-fit]`
 #[inline]
 pub(crate) fn basis<const N: usize>(local: Vec3, mean: f32) -> [f32; N] {
     let (x, y, mu) = (local.x, local.y, local.z.max(0.0));
