@@ -593,10 +593,10 @@ fn merge(base: &mut toml::Table, over: toml::Table) {
     }
 }
 
-/// The key of a number that is infinite or none.
+/// The key of a number that is infinite or none, or would be as the `f32` that most settings are.
 fn first_non_finite(table: &toml::Table) -> Option<String> {
     table.iter().find_map(|(key, value)| match value {
-        toml::Value::Float(v) if !v.is_finite() => Some(key.clone()),
+        toml::Value::Float(v) if !(*v as f32).is_finite() => Some(key.clone()),
         toml::Value::Table(inner) => first_non_finite(inner).map(|rest| format!("{key}.{rest}")),
         _ => None,
     })
