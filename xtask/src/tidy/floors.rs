@@ -99,8 +99,8 @@ pub const PACKAGES: &[Package] = &[
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2", "libm"]),
     Package { name: "diamond-losses", floor: 2, outside: Some(&["libm"]), optional: &[], alone: Some(SIMD) },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
-    heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2"]),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
+    heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2"]),
     heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
     heavy(
         "diamond-sss",
