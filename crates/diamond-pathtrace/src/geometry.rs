@@ -30,6 +30,16 @@ impl Facing {
             Facing::Any => true,
         }
     }
+
+    /// Of the crossings that enter and those that leave, one bit each, the wanted ones.
+    #[inline]
+    pub(crate) fn of(self, entering: u32, leaving: u32) -> u32 {
+        match self {
+            Facing::Entering => entering,
+            Facing::Leaving => leaving,
+            Facing::Any => entering | leaving,
+        }
+    }
 }
 
 /// Where a ray meets a surface.

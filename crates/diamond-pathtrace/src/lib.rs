@@ -36,6 +36,7 @@ pub mod fresnel;
 mod geometry;
 pub mod ggx;
 mod gltf_file;
+mod hierarchy;
 mod light;
 mod medium;
 mod mesh;

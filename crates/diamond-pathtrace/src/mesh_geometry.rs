@@ -1,39 +1,20 @@
 //! Rays against a closed mesh: an eight-way bounding volume hierarchy over watertight triangles.
 //!
-//! The hierarchy is `obvhs`'s compressed eight-wide one. It ignores boxes that end within 10⁻⁴ of a ray's origin, so it is built
-//! in units in which the mesh is 2¹⁶ wide (a power of two, hence exact), where that is far below the resolution of
-//! an `f32`; boxes are widened against the rounding of their test.
+//! The hierarchy is in units in which the mesh is about 1 wide (a power of two, hence exact), so that products of three coordinates
+//! neither over- nor underflow.
 use crate::clearance::Clearance;
 use crate::geometry::{Crossing, Facing, Hit};
-use crate::triangle::ShearedRay;
+use crate::hierarchy::{Hierarchy, HierarchyRay, triangle_box};
 use crate::{Mesh, PathtraceError};
-use glam::{Vec2, Vec3, Vec3A};
-use obvhs::BvhBuildParams;
+use glam::{Vec2, Vec3};
 use obvhs::aabb::Aabb;
-use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
-use obvhs::cwbvh::CwBvh;
-use obvhs::cwbvh::bvh2_to_cwbvh::bvh2_to_cwbvh;
-use obvhs::ploc::PlocBuilder;
-use obvhs::ray::{Ray, RayHit};
+use std::ops::ControlFlow;
 
 /// Boxes are widened by this fraction of the mesh's size (its largest coordinate): a few units in the last place of positions.
 const BOX_MARGIN: f32 = 5e-7;
 
 /// Rays that are farther away than this many sizes of the mesh lose all precision and meet nothing.
 const MAX_ORIGIN: f32 = 1e7;
-
-/// The steps of `obvhs`'s own builder, without its check of the result, whose tolerances are absolute and made for units near 1.
-fn build(boxes: &[Aabb], parameters: &BvhBuildParams) -> CwBvh {
-    let mut binary = PlocBuilder::with_capacity(boxes.len()).build(
-        parameters.ploc_search_distance,
-        boxes,
-        (0..boxes.len() as u32).collect(),
-        parameters.sort_precision,
-        parameters.search_depth_threshold,
-    );
-    ReinsertionOptimizer::default().run(&mut binary, parameters.reinsertion_batch_ratio, None);
-    bvh2_to_cwbvh(&binary, parameters.max_prims_per_leaf.clamp(1, 3), true, false)
-}
 
 /// A mesh ready for rays.
 #[derive(Clone)]
@@ -43,9 +24,7 @@ pub struct MeshGeometry {
     normals: Vec<Vec3>,
     /// Scene units → units of the hierarchy, a power of two.
     scale: f32,
-    bvh: CwBvh,
-    /// Corners in units and order of the hierarchy.
-    corners: Vec<[[f32; 3]; 3]>,
+    hierarchy: Hierarchy,
     clearance: Clearance,
     bounds: (Vec3, Vec3),
 }
@@ -69,18 +48,11 @@ impl MeshGeometry {
                 advice: "scale it: sizes from 10⁻⁹ to 10⁹ can be traced",
             });
         }
-        let scale = 2f32.powi(15 - size.log2().floor() as i32);
-        let margin = Vec3A::splat(BOX_MARGIN * size * scale);
-        let scaled = |t: usize| mesh.corners(t).map(|c| c * scale);
-        let boxes: Vec<Aabb> = (0..mesh.triangles.len())
-            .map(|t| {
-                let [a, b, c] = scaled(t).map(Vec3A::from);
-                Aabb::new(a.min(b).min(c) - margin, a.max(b).max(c) + margin)
-            })
-            .collect();
-        let parameters = BvhBuildParams { pre_split: false, ..BvhBuildParams::medium_build() };
-        let bvh = build(&boxes, &parameters);
-        let corners = bvh.primitive_indices.iter().map(|t| scaled(*t as usize).map(|c| c.to_array())).collect();
+        let scale = 2f32.powi(-(size.log2().floor() as i32));
+        let scaled = |t: u32| mesh.corners(t as usize).map(|c| c * scale);
+        let boxes: Vec<Aabb> =
+            (0..mesh.triangles.len() as u32).map(|t| triangle_box(scaled(t), BOX_MARGIN * size * scale)).collect();
+        let hierarchy = Hierarchy::new(&boxes, scaled);
         let normals =
             (0..mesh.triangles.len()).map(|t| mesh.area_vector(t).normalize_or(glam::DVec3::Z).as_vec3()).collect();
         let triangle_boxes: Vec<(Vec3, Vec3)> = (0..mesh.triangles.len())
@@ -90,7 +62,7 @@ impl MeshGeometry {
             })
             .collect();
         let clearance = Clearance::new(&triangle_boxes);
-        Ok(Self { mesh, normals, scale, bvh, corners, clearance, bounds })
+        Ok(Self { mesh, normals, scale, hierarchy, clearance, bounds })
     }
 
     /// The mesh.
@@ -125,39 +97,39 @@ impl MeshGeometry {
         self.clearance.at(point)
     }
 
+    /// The ray and its end in units of the hierarchy.
     #[inline]
-    fn prepared(&self, origin: Vec3, direction: Vec3, max: f32) -> Option<(ShearedRay, Ray)> {
+    fn prepared(&self, origin: Vec3, direction: Vec3, max: f32) -> Option<(HierarchyRay, f32)> {
         let origin = origin * self.scale;
         // Written so that NaN fails it.
-        let usable = origin.abs().max_element() <= 65536.0 * MAX_ORIGIN && direction.is_finite() && max > 0.0;
-        if !usable {
-            return None;
-        }
-        let ray = Ray::new(origin.into(), direction.into(), 0.0, max * self.scale);
-        Some((ShearedRay::new(origin, direction), ray))
+        let usable = origin.abs().max_element() <= MAX_ORIGIN && direction.is_finite() && max > 0.0;
+        usable.then(|| (HierarchyRay::new(origin, direction), max * self.scale))
     }
 
     /// See [`crate::Geometry::closest_hit`].
     #[inline]
     pub fn closest_hit(&self, origin: Vec3, direction: Vec3, max: f32, facing: Facing, skip: u32) -> Option<Hit> {
-        let (sheared, ray) = self.prepared(origin, direction, max)?;
-        let mut best = (u32::MAX, [0.0f32; 2], false);
-        let mut nearest = ray.tmax;
-        let mut record = RayHit::none();
-        self.bvh.ray_traverse(ray, &mut record, |_, slot| {
-            let Some(hit) = sheared.intersect(&self.corners[slot]) else { return f32::INFINITY };
-            let triangle = self.bvh.primitive_indices[slot];
-            if hit.t >= nearest || !facing.accepts(hit.entering) || triangle == skip {
-                return f32::INFINITY;
+        let (ray, limit) = self.prepared(origin, direction, max)?;
+        let mut nearest = limit;
+        let mut best = (u32::MAX, [0.0f32; 3], false);
+        self.hierarchy.visit::<true>(&ray, limit, |hits, names| {
+            let mut met = facing.of(hits.entering, hits.leaving);
+            while met != 0 {
+                let i = met.trailing_zeros() as usize;
+                met &= met - 1;
+                let t = hits.t[i];
+                if t > 0.0 && t < nearest && names[i] != skip {
+                    nearest = t;
+                    best = (names[i], hits.edges(i), hits.entering >> i & 1 == 1);
+                }
             }
-            nearest = hit.t;
-            best = (triangle, hit.barycentric, hit.entering);
-            hit.t
+            ControlFlow::Continue(nearest)
         });
-        let (primitive, [v, w], entering) = best;
+        let (primitive, [u, v, w], entering) = best;
         if primitive == u32::MAX {
             return None;
         }
+        let (v, w) = (v / (u + v + w), w / (u + v + w));
         let [a, b, c] = self.mesh.corners(primitive as usize);
         // Relative to a corner: sums of large coordinates would round away the surface.
         let position = a + (b - a) * v + (c - a) * w;
@@ -171,26 +143,48 @@ impl MeshGeometry {
         })
     }
 
+    /// Shows `visit` each crossing of a ray before `max`, in no order: triangle, distance in units of the hierarchy, whether it enters.
+    /// `true` goes on.
+    #[inline]
+    fn each(
+        &self,
+        origin: Vec3,
+        direction: Vec3,
+        max: f32,
+        facing: Facing,
+        mut visit: impl FnMut(u32, f32, bool) -> bool,
+    ) {
+        let Some((ray, limit)) = self.prepared(origin, direction, max) else { return };
+        self.hierarchy.visit::<false>(&ray, limit, |hits, names| {
+            let mut met = facing.of(hits.entering, hits.leaving);
+            while met != 0 {
+                let i = met.trailing_zeros() as usize;
+                met &= met - 1;
+                let t = hits.t[i];
+                if t > 0.0 && t < limit && !visit(names[i], t, hits.entering >> i & 1 == 1) {
+                    return ControlFlow::Break(());
+                }
+            }
+            ControlFlow::Continue(limit)
+        });
+    }
+
     /// See [`crate::Geometry::occluded`].
     #[inline]
     pub fn occluded(&self, origin: Vec3, direction: Vec3, max: f32, facing: Facing, skip: u32) -> bool {
-        let Some((sheared, ray)) = self.prepared(origin, direction, max) else { return false };
-        let limit = ray.tmax;
-        !self.bvh.ray_traverse_miss(ray, |_, slot| match sheared.intersect(&self.corners[slot]) {
-            Some(hit) if hit.t < limit && facing.accepts(hit.entering) && self.bvh.primitive_indices[slot] != skip => {
-                hit.t
-            }
-            _ => f32::INFINITY,
-        })
+        let mut met = false;
+        self.each(origin, direction, max, facing, |triangle, _, _| {
+            met |= triangle != skip;
+            !met
+        });
+        met
     }
 
     /// The triangles that an endless ray crosses, in no order.
     pub(crate) fn each_crossing(&self, origin: Vec3, direction: Vec3, mut visit: impl FnMut(u32)) {
-        let Some((sheared, ray)) = self.prepared(origin, direction, f32::INFINITY) else { return };
-        self.bvh.ray_traverse_anyhit(ray, |_, slot| {
-            if sheared.intersect(&self.corners[slot]).is_some() {
-                visit(self.bvh.primitive_indices[slot]);
-            }
+        self.each(origin, direction, f32::INFINITY, Facing::Any, |triangle, _, _| {
+            visit(triangle);
+            true
         });
     }
 
@@ -198,18 +192,14 @@ impl MeshGeometry {
     #[inline]
     pub(crate) fn crossings(&self, origin: Vec3, direction: Vec3, max: f32, skip: u32) -> Crossing {
         let mut sum = Crossing::default();
-        let Some((sheared, ray)) = self.prepared(origin, direction, max) else { return sum };
-        let limit = ray.tmax;
-        self.bvh.ray_traverse_anyhit(ray, |_, slot| {
-            if let Some(hit) = sheared.intersect(&self.corners[slot])
-                && hit.t < limit
-                && self.bvh.primitive_indices[slot] != skip
-            {
-                let sign = if hit.entering { -1.0 } else { 1.0 };
-                sum.length += sign * hit.t;
-                sum.exits += if hit.entering { -1 } else { 1 };
+        self.each(origin, direction, max, Facing::Any, |triangle, t, entering| {
+            if triangle != skip {
+                let sign = if entering { -1.0 } else { 1.0 };
+                sum.length += sign * t;
+                sum.exits += if entering { -1 } else { 1 };
                 sum.count += 1;
             }
+            true
         });
         sum.length /= self.scale;
         sum

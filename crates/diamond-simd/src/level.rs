@@ -3,7 +3,7 @@ use crate::instruction_set::{InstructionSet, InstructionSetError, current};
 use pulp::{Simd, WithSimd};
 
 #[derive(Debug, Clone, Copy)]
-enum Kind {
+pub(crate) enum Kind {
     Portable,
     #[cfg(target_arch = "x86_64")]
     Avx2Fma(pulp::x86::V3),
@@ -60,6 +60,11 @@ impl Level {
         levels.extend(Self::EMULATED);
         levels.shrink_to_fit();
         levels
+    }
+
+    #[inline]
+    pub(crate) fn kind(self) -> Kind {
+        self.0
     }
 
     /// Runs a kernel.

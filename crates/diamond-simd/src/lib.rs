@@ -45,12 +45,14 @@
 //! assert!(values.iter().all(|v| (v - std::f32::consts::E).abs() < 1e-6));
 //! ```
 mod block;
+mod eight;
 mod elementary;
 mod instruction_set;
 mod lanes;
 mod level;
 
 pub use block::{BLOCK, Block, any_positive, load_block, store_block, sum_block, tree_sum};
+pub use eight::{Eight, Octet, WithEight};
 pub use elementary::{exp, exp2, exp2_of, exp2_of_all, ln, ln_1p_exp, log2, root_2_2, root_2_4, sigmoid, sin_cos_pi};
 pub use instruction_set::{ENVIRONMENT_VARIABLE, InstructionSet, InstructionSetError, current, fix, from_environment};
 pub use lanes::{Lanes, Mask};
