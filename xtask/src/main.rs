@@ -7,7 +7,7 @@ use xtask::oracle::{self, OracleKind};
 use xtask::{fixtures, suite, tidy};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
-const BENCHES: [&str; 1] = ["splat"];
+const BENCHES: [&str; 2] = ["splat", "transport"];
 
 const EXAMPLES: &str = "\
 Examples:
@@ -15,6 +15,7 @@ Examples:
   cargo xtask oracle ggx assets/fixtures/ggx        our microfacet terms against a table
   cargo xtask oracle splat scenes/dense_1000.npz    one splat scene
   cargo xtask bench splat                           time and error of the rasteriser
+  cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
   cargo xtask tidy --rules                          the house rules and their reasons
   cargo xtask fixtures --update                     accept the reference files as they are now
 
@@ -50,7 +51,7 @@ enum Tool {
         #[arg(long)]
         full: bool,
     },
-    /// Measure run time and error: `cargo xtask bench splat`.
+    /// Measure run time and error: `cargo xtask bench splat`, `cargo xtask bench transport`.
     Bench {
         /// What to measure.
         #[arg(value_parser = BENCHES)]

@@ -268,6 +268,24 @@ impl Geometry {
         }
     }
 
+    /// Whether a flight that starts inside certainly ends inside and meets no surface on its way. `false` says nothing.
+    #[inline]
+    pub(crate) fn holds_flight(&self, origin: Vec3, direction: Vec3, distance: f32) -> bool {
+        match self {
+            Geometry::Mesh(mesh) => distance < mesh.clearance(origin),
+            // Convex: both ends inside will do. A few units in the last place are for the rounding.
+            Geometry::Sphere { centre, radius } => {
+                let limit = radius * radius * (1.0 - 4e-6);
+                let start = origin - *centre;
+                (start + direction * distance).length_squared() < limit && start.length_squared() < limit
+            }
+            Geometry::Slab { bottom, top } => {
+                let end = origin.z + direction.z * distance;
+                end < *top && end > *bottom && origin.z < *top && origin.z > *bottom
+            }
+        }
+    }
+
     /// Unit normal for a coat at a hit: interpolated where a mesh has vertex normals.
     pub fn shading_normal(&self, hit: &Hit) -> Vec3 {
         match self {

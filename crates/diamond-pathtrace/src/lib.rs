@@ -53,6 +53,7 @@ mod repair_nesting;
 mod rng;
 pub mod sampling;
 mod scene;
+mod sobol;
 mod triangle;
 
 pub use boundary::{Boundary, BoundarySample};

@@ -14,7 +14,7 @@ use glam::Vec3;
 const ROULETTE: f32 = 0.5;
 
 /// Connections from a point that is so deep that no lamp can bring more than this are made at random, in proportion.
-const CONNECTION_ROULETTE: f32 = 0.05;
+const CONNECTION_ROULETTE: f32 = 0.5;
 
 /// How paths are traced.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,6 +61,8 @@ pub struct Tracer<'a> {
     /// Indices of the discs.
     discs: Vec<usize>,
     any_inside: bool,
+    /// Whether connections that can bring little are left to chance: where they cost more than to find that out.
+    sparing: bool,
     bounds: (Vec3, Vec3),
     options: PathOptions,
 }
@@ -96,12 +98,14 @@ impl<'a> Tracer<'a> {
                 Lamp { light, inside: light.ball().is_some_and(touches) }
             })
             .collect();
+        let any_inside = lamps.iter().any(|lamp| lamp.inside);
         Ok(Self {
             scene,
             medium: scene.material.medium,
             boundary: scene.material.boundary.effective(),
             discs: (0..lamps.len()).filter(|l| matches!(lamps[*l].light, Light::Disc { .. })).collect(),
-            any_inside: lamps.iter().any(|lamp| lamp.inside),
+            any_inside,
+            sparing: !any_inside && (matches!(scene.geometry, crate::Geometry::Mesh(_)) || lamps.len() > 2),
             lamps,
             bounds: (low, high),
             options,
@@ -179,7 +183,7 @@ impl<'a> Tracer<'a> {
     fn inside(&self, p: &mut State, rng: &mut Rng, radiance: &mut [Vec3]) -> bool {
         let geometry = &self.scene.geometry;
         let flight = self.medium.fly(p.throughput, rng);
-        let free = flight.distance < geometry.clearance(p.origin);
+        let free = geometry.holds_flight(p.origin, p.direction, flight.distance);
         let hit = match free {
             true => None,
             false => geometry.closest_hit(p.origin, p.direction, flight.distance, Facing::Leaving, p.skip),
@@ -248,7 +252,7 @@ impl<'a> Tracer<'a> {
         let geometry = &self.scene.geometry;
         let mut throughput = p.throughput;
         // No lamp outside brings more than what is left on the way to the nearest surface.
-        if !self.any_inside {
+        if self.sparing {
             let bound = (throughput * self.medium.transmittance(geometry.clearance(p.origin))).max_element();
             if bound < CONNECTION_ROULETTE {
                 let probability = bound / CONNECTION_ROULETTE;

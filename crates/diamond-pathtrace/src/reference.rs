@@ -1,8 +1,10 @@
 //! Pictures without bias, with the standard error of every pixel.
 //!
-//! Every pixel averages independent paths through random points of its square, so its standard error is what the spread of the
-//! paths says. One pass makes the pictures of all lamps.
+//! Every pixel averages paths through points of its square. The first numbers of its paths (place, depth, direction) are
+//! evenly spread points; several independently shifted sets of them say by their spread what the standard error is. One pass makes the pictures of
+//! all lamps.
 use crate::path::{PathEnd, PathOptions, Tracer};
+use crate::sobol::Sobol;
 use crate::{PathtraceError, Rng, Scene};
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -117,33 +119,51 @@ pub fn render_reference(
     Ok(ReferenceImage { lights, coverage, events: sum(|p| p.events), truncated: sum(|p| p.truncated) })
 }
 
+/// Independent sets into which a pixel's paths are divided, if there are enough: within a set paths avoid each other, and the spread of
+/// the sets' means says how far their mean may be off.
+const SETS: u32 = 16;
+
+/// Smaller sets gain nothing.
+const SMALLEST_SET: u32 = 4;
+
 /// The paths of one pixel.
 fn gather(tracer: &Tracer, camera: &Camera, corner: Vec2, inside: bool, samples: u32, mut rng: Rng) -> Pixel {
     let lamps = tracer.scene().lights.len();
+    let sets = (samples / SMALLEST_SET).clamp(samples.min(SETS / 2), SETS);
     let mut radiance = vec![Vec3::ZERO; lamps];
+    let mut set = vec![DVec3::ZERO; lamps];
+    // Sums over paths; and, over sets, of squared sums and of sums, each over the number of paths.
     let mut sums = vec![(DVec3::ZERO, DVec3::ZERO); lamps];
     let (mut hits, mut events, mut truncated) = (0u32, 0, 0);
-    for _ in 0..samples {
-        let ray = camera.ray(corner + Vec2::new(rng.uniform(), rng.uniform()));
-        let end: PathEnd = tracer.trace(ray.origin, ray.direction, inside, &mut rng, &mut radiance);
-        events += u64::from(end.events);
-        truncated += u64::from(end.truncated);
-        if !end.hit && !tracer.shows_lights() {
-            continue;
+    for k in 0..sets {
+        let count = samples / sets + u32::from(k < samples % sets);
+        rng.drop_lead();
+        let mut points = Sobol::new(std::array::from_fn(|_| rng.bits()));
+        set.fill(DVec3::ZERO);
+        for _ in 0..count {
+            rng.lead_with(points.draw());
+            let ray = camera.ray(corner + Vec2::new(rng.uniform(), rng.uniform()));
+            let end: PathEnd = tracer.trace(ray.origin, ray.direction, inside, &mut rng, &mut radiance);
+            events += u64::from(end.events);
+            truncated += u64::from(end.truncated);
+            if !end.hit && !tracer.shows_lights() {
+                continue;
+            }
+            hits += u32::from(end.hit);
+            set.iter_mut().zip(&radiance).for_each(|(sum, value)| *sum += value.as_dvec3());
         }
-        hits += u32::from(end.hit);
-        for ((sum, square), value) in sums.iter_mut().zip(&radiance) {
-            let value = value.as_dvec3();
-            *sum += value;
-            *square += value * value;
+        for ((sum, square), set) in sums.iter_mut().zip(&set) {
+            *sum += *set;
+            *square += *set * *set / f64::from(count);
         }
     }
-    let n = f64::from(samples);
+    let (n, sets) = (f64::from(samples), f64::from(sets));
     let values = sums
         .into_iter()
         .map(|(sum, square)| {
             let mean = sum / n;
-            let variance = ((square / n - mean * mean) / (n - 1.0)).max(DVec3::ZERO);
+            // Sets of m paths have the variance V/m around the mean: V is the mean over sets of m·(set's mean − mean)².
+            let variance = ((square - mean * sum) / ((sets - 1.0) * n)).max(DVec3::ZERO);
             let error = DVec3::new(variance.x.sqrt(), variance.y.sqrt(), variance.z.sqrt());
             (mean.as_vec3(), error.as_vec3())
         })

@@ -8,6 +8,7 @@
 //! let (mut a, mut b) = (Rng::new(7, 3), Rng::new(7, 3));
 //! assert!((0..9).all(|_| a.uniform() == b.uniform()));
 //! ```
+use crate::sobol::DIMENSIONS;
 use rand_pcg::Pcg32;
 use rand_pcg::rand_core::Rng as _;
 
@@ -16,7 +17,12 @@ const UNIT: f32 = 1.0 / 4_294_967_296.0;
 
 /// A stream of random numbers.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Rng(Pcg32);
+pub struct Rng {
+    pcg: Pcg32,
+    /// Numbers that are drawn first, and how many of them have been.
+    lead: [u32; DIMENSIONS],
+    led: usize,
+}
 
 /// The mixing function of SplitMix64 (Steele, Lea and Flood 2014), a bijection of 64 bits.
 pub(crate) fn mix(mut z: u64) -> u64 {
@@ -30,13 +36,29 @@ impl Rng {
     /// Stream `stream` of `seed`. Streams are independent for all practical purposes.
     pub fn new(seed: u64, stream: u64) -> Self {
         let state = mix(seed ^ mix(stream));
-        Self(Pcg32::new(state, mix(state ^ stream)))
+        Self { pcg: Pcg32::new(state, mix(state ^ stream)), lead: [0; DIMENSIONS], led: DIMENSIONS }
+    }
+
+    /// Makes these the next numbers that [`Rng::bits`] returns; what is left of earlier ones is dropped.
+    #[inline]
+    pub(crate) fn lead_with(&mut self, numbers: [u32; DIMENSIONS]) {
+        (self.lead, self.led) = (numbers, 0);
+    }
+
+    /// Goes on with random numbers.
+    #[inline]
+    pub(crate) fn drop_lead(&mut self) {
+        self.led = DIMENSIONS;
     }
 
     /// 32 random bits.
     #[inline]
     pub fn bits(&mut self) -> u32 {
-        self.0.next_u32()
+        if let Some(number) = self.lead.get(self.led) {
+            self.led += 1;
+            return *number;
+        }
+        self.pcg.next_u32()
     }
 
     /// Uniform in [0, 1), a multiple of 2⁻²⁴.

@@ -51,7 +51,11 @@ fn three(value: &Value, name: &str) -> Result<Vec3, String> {
     Ok(array.into())
 }
 
-fn read_scene(folder: &Path, json: &Value) -> Result<(Scene, Camera), String> {
+/// The scene and the camera that an entry of `refs.json` in `folder` describes.
+///
+/// # Errors
+/// The field, and what was expected.
+pub fn read_scene(folder: &Path, json: &Value) -> Result<(Scene, Camera), String> {
     let shape = field(json, "shape")?.as_str().ok_or("shape: expected text")?;
     let geometry = if shape.starts_with("unit sphere") {
         Geometry::Sphere { centre: Vec3::ZERO, radius: 1.0 }
