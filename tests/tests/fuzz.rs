@@ -6,6 +6,7 @@
 mod allocation;
 mod captures;
 mod harness;
+mod meshes;
 mod models;
 mod mutate;
 mod random;
@@ -47,6 +48,7 @@ fn targets(folder: &Path) -> Vec<Target> {
     let mut out = captures::targets(folder);
     out.extend(models::targets(folder));
     out.extend(splats::targets());
+    out.extend(meshes::targets());
     out
 }
 

@@ -87,6 +87,16 @@ fn add_primitive(
     for accessor in wanted.iter().filter_map(|s| primitive.get(s)).chain(primitive.indices()) {
         check_accessor(&accessor, buffers)?;
     }
+    use gltf::accessor::DataType;
+    if let Some(accessor) = primitive.indices()
+        && !matches!(accessor.data_type(), DataType::U8 | DataType::U16 | DataType::U32)
+    {
+        return Err(format!(
+            "accessor {}: indices are whole numbers, not {:?}",
+            accessor.index(),
+            accessor.data_type()
+        ));
+    }
     let reader = primitive.reader(|buffer| buffers.get(buffer.index()).map(Vec::as_slice));
     let first = mesh.positions.len();
     let positions = reader.read_positions().ok_or("a primitive without positions")?;
@@ -163,10 +173,35 @@ fn read_material(material: &gltf::Material) -> Result<(Coat, Option<Material>), 
     Ok((coat, Some(found)))
 }
 
+/// Bytes of the header of a `.glb` file, the last four of which are the file's length.
+const GLB_HEADER: usize = 12;
+
+/// A file as the `gltf` crate reads it, after the checks that it assumes to have been made.
+fn document(bytes: &[u8]) -> Result<gltf::Gltf, String> {
+    if let (true, Some(length)) = (bytes.starts_with(b"glTF"), bytes.get(8..GLB_HEADER)) {
+        let length = length.iter().rev().fold(0usize, |n, b| n << 8 | usize::from(*b));
+        if length < GLB_HEADER {
+            return Err(format!("the header says that the file has {length} bytes; it alone has {GLB_HEADER}"));
+        }
+    }
+    let file = gltf::Gltf::from_slice_without_validation(bytes).map_err(|e| e.to_string())?;
+    let (blob, root) = (file.blob, file.document.into_json());
+    let accessors = root.accessors.len();
+    for (m, mesh) in root.meshes.iter().enumerate() {
+        for index in mesh.primitives.iter().flat_map(|p| p.attributes.values()) {
+            if index.value() >= accessors {
+                return Err(format!("mesh {m} uses accessor {}; there are {accessors}", index.value()));
+            }
+        }
+    }
+    let document = gltf::Document::from_json(root).map_err(|e| e.to_string())?;
+    Ok(gltf::Gltf { document, blob })
+}
+
 /// Reads the object in the bytes of a `.gltf` or `.glb` file; buffers beside it are looked for in `folder`. The message says what is
 /// wrong.
 pub fn parse_gltf(bytes: &[u8], folder: Option<&Path>) -> Result<GltfObject, String> {
-    let file = gltf::Gltf::from_slice(bytes).map_err(|e| e.to_string())?;
+    let file = document(bytes)?;
     let buffers: Vec<Vec<u8>> =
         file.buffers().map(|buffer| buffer_bytes(&buffer, file.blob.as_deref(), folder)).collect::<Result<_, _>>()?;
     let scene = file.default_scene().or_else(|| file.scenes().next()).ok_or("the file has no scene")?;

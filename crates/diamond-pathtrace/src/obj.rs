@@ -4,9 +4,34 @@ use glam::{Vec2, Vec3};
 use std::io::Cursor;
 use std::path::Path;
 
+/// `Err` where a face counts back beyond the first vertex, texture coordinate or normal, or on beyond 2³²; `tobj` expects neither.
+fn check_indices(bytes: &[u8]) -> Result<(), String> {
+    let mut counts = [0i64; 3];
+    for (n, line) in bytes.split(|b| *b == b'\n' || *b == b'\r').enumerate() {
+        let line = String::from_utf8_lossy(line);
+        let mut words = line.split_whitespace();
+        match words.next() {
+            Some("v") => counts[0] += 1,
+            Some("vt") => counts[1] += 1,
+            Some("vn") => counts[2] += 1,
+            Some("f" | "l" | "p") => {
+                for (word, count) in words.flat_map(|word| word.split('/').zip(counts)) {
+                    let Ok(index) = word.parse::<i64>() else { continue };
+                    if !(-count..=i64::from(u32::MAX)).contains(&index) {
+                        return Err(format!("line {}: index {index}, where {count} have been listed before", n + 1));
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 /// Reads the mesh in the text of an OBJ file: all its objects together, polygons cut into triangles. The message says what is
 /// wrong.
 pub fn parse_obj(bytes: &[u8]) -> Result<Mesh, String> {
+    check_indices(bytes)?;
     let options = tobj::LoadOptions { single_index: true, triangulate: true, ..Default::default() };
     let no_materials = |_: &Path| Err(tobj::LoadError::OpenFileFailed);
     let (models, _) = tobj::load_obj_buf(&mut Cursor::new(bytes), &options, no_materials).map_err(|e| e.to_string())?;
