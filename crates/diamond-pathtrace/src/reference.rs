@@ -121,7 +121,7 @@ pub fn render_reference(
 
 /// Independent sets into which a pixel's paths are divided, if there are enough: within a set paths avoid each other, and the spread of
 /// the sets' means says how far their mean may be off.
-const SETS: u32 = 16;
+const SETS: u32 = 64;
 
 /// Smaller sets gain nothing.
 const SMALLEST_SET: u32 = 4;
@@ -129,7 +129,7 @@ const SMALLEST_SET: u32 = 4;
 /// The paths of one pixel.
 fn gather(tracer: &Tracer, camera: &Camera, corner: Vec2, inside: bool, samples: u32, mut rng: Rng) -> Pixel {
     let lamps = tracer.scene().lights.len();
-    let sets = (samples / SMALLEST_SET).clamp(samples.min(SETS / 2), SETS);
+    let sets = (samples / SMALLEST_SET).clamp(samples.min(8), SETS);
     let mut radiance = vec![Vec3::ZERO; lamps];
     let mut set = vec![DVec3::ZERO; lamps];
     // Sums over paths; and, over sets, of squared sums and of sums, each over the number of paths.

@@ -93,18 +93,12 @@ pub fn run(out: &Path, plots: Option<&Path>) -> Result<(), String> {
         curves.push(Curve { name: name.into(), points, labels });
         Ok(())
     };
-    vary("points", &[125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0], &|v| BulkOptions {
-        points: v as u32,
-        ..base
-    })?;
+    vary("points", &[125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0], &|v| BulkOptions { points: v as u32, ..base })?;
     vary("walks per point", &[16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0], &|v| BulkOptions {
         walks: v as u32,
         ..base
     })?;
-    vary("light maps", &[0.0, 16.0, 32.0, 64.0, 128.0, 256.0], &|v| BulkOptions {
-        visibility: v as u32,
-        ..base
-    })?;
+    vary("light maps", &[0.0, 16.0, 32.0, 64.0, 128.0, 256.0], &|v| BulkOptions { visibility: v as u32, ..base })?;
     vary("bulk", &[1.0, 2.0, 4.0, 8.0, 16.0, 32.0], &|v| BulkOptions {
         points: (500.0 * f64::sqrt(v)) as u32,
         walks: (64.0 * v) as u32,

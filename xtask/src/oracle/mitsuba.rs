@@ -22,12 +22,12 @@ const SIGMAS: f64 = 4.0;
 /// Fraction of values that may be farther off.
 const OUTSIDE: f64 = 0.01;
 /// Paths per pixel.
-const SAMPLES: u32 = 512;
+const SAMPLES: u32 = 1024;
 /// Behind a boundary so many times more: what a facet refracts towards a lamp without extent is rare and bright, and with few paths
 /// the spread of a pixel's paths says less than its error.
 const MORE_BEHIND_BOUNDARIES: u32 = 8;
 
-/// Compares our pictures with those in the folder `path`, with 512 paths per pixel (4096 behind a boundary).
+/// Compares our pictures with those in the folder `path`, with 1024 paths per pixel (8192 behind a boundary).
 ///
 /// # Errors
 /// A message that names the file and the field when a scene or a picture cannot be read.
