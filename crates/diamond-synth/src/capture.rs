@@ -4,6 +4,7 @@
 //! Whoever is interrupted goes on: images that are there are not rendered again, and the bytes are the same in the end.
 //! Held-out images come from a solution with random numbers of its own, so that what training images have in common with
 //! each other they do not have in common with them.
+use crate::measure::{Measurement, bulk_options, lit};
 use crate::object::points_ply;
 use crate::{Object, Plan, PlannedView, Recipe, SynthError};
 use diamond_camera::Camera;
@@ -12,33 +13,25 @@ use diamond_dataset::{
     ViewDescription, encode_exr,
 };
 use diamond_image::{Mask, Transfer};
-use diamond_light::{Falloff, OlatLight};
-use diamond_pathtrace::{
-    Bulk, BulkError, BulkOptions, BulkView, Light, ReferenceOptions, RepairReport, Scene, measure_bulk,
-};
+use diamond_light::OlatLight;
+use diamond_pathtrace::{Bulk, BulkError, BulkOptions, BulkView, RepairReport};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::Path;
 
 /// Lights that share a solution at most: bounds its memory.
 const LIGHTS_PER_SOLUTION: usize = 128;
-/// Seeds of held-out images, of the measurement, of the exposure and of points are the recipe's with these bits turned.
+/// Seeds of held-out images, of the exposure and of points are the recipe's with these bits turned.
 const HELD_OUT: u64 = 0x7465_7374;
-const MEASURED: u64 = 0x0065_7272_6f72;
 const EXPOSED: u64 = 0x6578_706f;
 /// Points and walks of the solution that finds the exposure.
 const EXPOSURE_EFFORT: (u32, u32) = (1000, 64);
-/// Views and largest side of its pictures, and of those that are compared with the reference.
+/// Views and largest side of its pictures.
 const EXPOSURE_VIEWS: usize = 4;
 const EXPOSURE_SIDE: u32 = 48;
 /// So many of the covered values are above [`BRIGHT`] after exposure.
 const BRIGHT_SHARE: f64 = 0.01;
 const BRIGHT: f32 = 0.9;
-/// Lights and views of the comparison with the reference, the side of its pictures, and paths per pixel.
-const MEASURED_LIGHTS: usize = 4;
-const MEASURED_VIEWS: usize = 2;
-const MEASURED_SIDE: u32 = 32;
-const MEASURED_PATHS: u32 = 512;
 
 /// What is being done, for progress bars.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -106,10 +99,10 @@ pub fn synthesize(
         let missing: Vec<usize> = views.iter().copied().filter(|&v| !job.is_written(&capture, v)).collect();
         done += job.images(views.iter().filter(|v| !missing.contains(v)));
         let Some(&first) = missing.first() else { continue };
-        let scene = job.scene(lights);
+        let scene = lit(recipe, &job.object, &job.plan, lights);
         let split = job.plan.views[first].split;
         let seed = recipe.seed ^ if split == Split::Test { HELD_OUT } else { 0 };
-        let options = job.options(seed.wrapping_add((g as u64) << 32));
+        let options = bulk_options(recipe, seed.wrapping_add((g as u64) << 32));
         let stage = Stage::Solve(g + 1, groups.len());
         let bulk = Bulk::solve(&scene, &options, &|f| progress(stage, f))?;
         form = bulk.form();
@@ -124,7 +117,8 @@ pub fn synthesize(
     }
     let points = job.object.surface_points(recipe.film.points as usize, recipe.seed);
     capture.write_file("points3d.ply", &points_ply(&points))?;
-    let error = if recipe.quality.measure { Some(job.measure()?) } else { None };
+    let error =
+        if recipe.quality.measure { Some(job.measurement().run(&|f| progress(Stage::Measure, f))?) } else { None };
     let record = CaptureRecord {
         recipe_hash: hash,
         exposure,
@@ -140,27 +134,6 @@ pub fn synthesize(
 }
 
 impl Job<'_> {
-    fn options(&self, seed: u64) -> BulkOptions {
-        let (quality, default) = (&self.recipe.quality, BulkOptions::default());
-        BulkOptions {
-            points: quality.points.unwrap_or(default.points),
-            walks: quality.walks.unwrap_or(default.walks),
-            samples_per_axis: quality.samples_per_axis.unwrap_or(default.samples_per_axis),
-            seed,
-            ..default
-        }
-    }
-
-    fn scene(&self, lights: &[usize]) -> Scene {
-        let falloff = Falloff::InverseSquare { reference: self.recipe.rig.light_distance };
-        let olat = |l: &usize| Light::Olat { light: self.plan.lights[*l], falloff };
-        Scene {
-            geometry: self.object.geometry.clone(),
-            material: self.recipe.material.material(),
-            lights: lights.iter().map(olat).collect(),
-        }
-    }
-
     fn description(&self) -> CaptureDescription {
         let views = |split: Split| {
             let shot = |view: &PlannedView, light: usize| ShotDescription {
@@ -230,9 +203,13 @@ impl Job<'_> {
             lights.sort_unstable();
             lights.truncate(LIGHTS_PER_SOLUTION);
             let (points, walks) = EXPOSURE_EFFORT;
-            let options =
-                BulkOptions { points, walks, samples_per_axis: 1, ..self.options(self.recipe.seed ^ EXPOSED) };
-            let scene = self.scene(&lights);
+            let options = BulkOptions {
+                points,
+                walks,
+                samples_per_axis: 1,
+                ..bulk_options(self.recipe, self.recipe.seed ^ EXPOSED)
+            };
+            let scene = lit(self.recipe, &self.object, &self.plan, &lights);
             let bulk = Bulk::solve(&scene, &options, &|f| (self.progress)(Stage::Exposure, f))?;
             let picture = bulk.render(&resized(&view.camera, EXPOSURE_SIDE), self.recipe.seed)?;
             for image in &picture.lights {
@@ -248,20 +225,8 @@ impl Job<'_> {
         Ok(if bright > f32::MIN_POSITIVE { BRIGHT / bright } else { 1.0 })
     }
 
-    fn measure(&self) -> Result<BulkError, SynthError> {
-        let views: Vec<&PlannedView> = self.plan.views.iter().filter(|v| v.split == Split::Train).collect();
-        let spread = |n: usize, most: usize| (0..most.min(n)).map(move |k| k * n / most.min(n));
-        let cameras: Vec<Camera> = spread(views.len(), MEASURED_VIEWS)
-            .map(|k| resized(&views[k].camera, MEASURED_SIDE.min(self.recipe.film.resolution)))
-            .collect();
-        let lights: Vec<usize> = spread(views[0].lights.len(), MEASURED_LIGHTS).map(|k| views[0].lights[k]).collect();
-        let reference = ReferenceOptions {
-            samples: MEASURED_PATHS,
-            seed: self.recipe.seed ^ MEASURED,
-            ..ReferenceOptions::default()
-        };
-        let progress = |f| (self.progress)(Stage::Measure, f);
-        Ok(measure_bulk(&self.scene(&lights), &self.options(self.recipe.seed), &cameras, &reference, &progress)?)
+    fn measurement(&self) -> Measurement {
+        Measurement::new(self.recipe, &self.object, &self.plan)
     }
 
     fn json(&self, record: &CaptureRecord) -> Value {
@@ -269,10 +234,7 @@ impl Job<'_> {
             json!({
                 "bias": e.bias, "bias_standard_error": e.bias_standard_error, "rmse": e.rmse,
                 "rmse_of_root_mean_square": e.rmse_of_rms, "noise": e.noise, "noise_db": e.noise_db,
-                "against": format!(
-                    "unbiased reference, {MEASURED_PATHS} paths per pixel, {MEASURED_LIGHTS} lights, {MEASURED_VIEWS} views of \
-                     {MEASURED_SIDE}²; relative to the mean radiance"
-                ),
+                "bias_noise": e.bias_noise, "systematic": e.systematic(), "against": self.measurement().describe(),
             })
         });
         let lights: Vec<Value> =

@@ -1,7 +1,7 @@
 //! A family of random recipes: hundreds of objects and materials from one seed, for training.
 use crate::{
     BoundaryRecipe, CoatRecipe, FilmRecipe, HeldOutRecipe, MaterialRecipe, ObjectRecipe, QualityRecipe, Recipe,
-    RigRecipe, SynthError,
+    RigRecipe, SynthError, changed_table,
 };
 use diamond_pathtrace::Rng;
 use serde::{Deserialize, Serialize};
@@ -128,8 +128,20 @@ impl Family {
     /// # Errors
     /// [`SynthError::Recipe`].
     pub fn parse(text: &str, origin: &str) -> Result<Self, SynthError> {
+        Self::parse_changed(text, origin, &[])
+    }
+
+    /// Reads a family with changes such as `rig.views=4`, see [`changed_table`].
+    ///
+    /// # Errors
+    /// [`SynthError::Recipe`].
+    pub fn parse_changed(text: &str, origin: &str, changes: &[String]) -> Result<Self, SynthError> {
         let fail = |detail: String| SynthError::Recipe { origin: origin.into(), detail };
-        let family: Family = toml::from_str(text).map_err(|e| fail(e.to_string()))?;
+        let family: Result<Family, _> = match changes.is_empty() {
+            true => toml::from_str(text),
+            false => changed_table(text, origin, changes)?.try_into(),
+        };
+        let family = family.map_err(|e| fail(e.to_string()))?;
         family.member(0).check(origin)?;
         Ok(family)
     }

@@ -6,15 +6,19 @@
 //! images that follow, [`Object`] is the closed shape. A [`Family`] draws hundreds of recipes
 //! from one seed.
 mod capture;
+mod changes;
 mod error;
 mod family;
+mod measure;
 mod object;
 mod plan;
 mod recipe;
 
 pub use capture::{CaptureRecord, Progress, Stage, synthesize};
+pub use changes::changed_table;
 pub use error::SynthError;
 pub use family::Family;
+pub use measure::Measurement;
 pub use object::Object;
 pub use plan::{Plan, PlannedView};
 pub use recipe::{

@@ -2,7 +2,7 @@
 //!
 //! Lengths are scene units with the object inside the unit ball about the origin and z up; angles are degrees. A recipe
 //! and its files determine every byte of the capture.
-use crate::SynthError;
+use crate::{SynthError, changed_table};
 use diamond_pathtrace::{Boundary, Coat, DistanceField, Material, Medium, Operation, Solid, SurfaceNoise};
 use glam::{EulerRot, Quat, Vec3};
 use serde::{Deserialize, Serialize};
@@ -259,7 +259,7 @@ pub struct RigRecipe {
     pub camera_elevation: f32,
     /// Lowest elevation of lights, degrees.
     pub light_elevation: f32,
-    /// Horizontal angle of view, degrees.
+    /// Horizontal angle of view, degrees; from a distance of 4, 29 hold the unit ball.
     pub angle_of_view: f32,
 }
 
@@ -273,7 +273,7 @@ impl Default for RigRecipe {
             light_distance: 4.5,
             camera_elevation: -20.0,
             light_elevation: -10.0,
-            angle_of_view: 35.0,
+            angle_of_view: 30.0,
         }
     }
 }
@@ -331,11 +331,13 @@ pub struct QualityRecipe {
     pub walks: Option<u32>,
     /// Whether errors are measured against the reference and written into `capture.json`.
     pub measure: bool,
+    /// Paths per pixel of that reference.
+    pub measured_paths: u32,
 }
 
 impl Default for QualityRecipe {
     fn default() -> Self {
-        Self { samples_per_axis: None, points: None, walks: None, measure: true }
+        Self { samples_per_axis: None, points: None, walks: None, measure: true, measured_paths: 256 }
     }
 }
 
@@ -410,8 +412,21 @@ impl Recipe {
     /// # Errors
     /// [`SynthError::Recipe`].
     pub fn parse(text: &str, origin: &str) -> Result<Self, SynthError> {
+        Self::parse_changed(text, origin, &[])
+    }
+
+    /// Reads a recipe with changes such as `rig.views=4`, see [`changed_table`](crate::changed_table).
+    ///
+    /// # Errors
+    /// [`SynthError::Recipe`].
+    pub fn parse_changed(text: &str, origin: &str, changes: &[String]) -> Result<Self, SynthError> {
         let fail = |detail: String| SynthError::Recipe { origin: origin.into(), detail };
-        let recipe: Recipe = toml::from_str(text).map_err(|e| fail(e.to_string()))?;
+        // Without changes, errors say the line.
+        let recipe: Result<Recipe, _> = match changes.is_empty() {
+            true => toml::from_str(text),
+            false => changed_table(text, origin, changes)?.try_into(),
+        };
+        let recipe = recipe.map_err(|e| fail(e.to_string()))?;
         recipe.check(origin)?;
         Ok(recipe)
     }
@@ -430,6 +445,7 @@ impl Recipe {
             ("held_out.unseen_lights", self.held_out.unseen_lights, 0, MAX_LIGHTS),
             ("film.resolution", self.film.resolution, 8, MAX_RESOLUTION),
             ("film.points", self.film.points, 0, 10_000_000),
+            ("quality.measured_paths", self.quality.measured_paths, 2, 1 << 20),
         ];
         for (field, found, low, high) in counts {
             if !(low..=high).contains(&found) {

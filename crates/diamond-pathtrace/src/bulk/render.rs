@@ -23,6 +23,10 @@ const REFLECTIONS: u32 = 16;
 /// Pixels on outlines get this many times more samples per axis.
 const EDGE: u32 = 3;
 
+/// Highlights whose radiance differs by more than the first number between samples of a pixel (for an irradiance of 1) get so many times more samples per
+/// axis: a polished coat shows a lamp smaller than a pixel.
+const SHARP: [(f32, u32); 2] = [(0.01, 3), (0.2, 8)];
+
 /// The golden ratio's fractional part: its multiples fill the unit interval evenly, however many there are.
 const STEP: f32 = 0.618_034;
 
@@ -162,9 +166,10 @@ impl<'a, const N: usize> Gather<'a, N> {
         for (ray, hit) in shaded {
             depth += (hit.position - ray.origin).dot(forward);
             normal += geometry.shading_normal(hit);
-            self.coat(*ray, hit, share);
             see(&mut self, *ray, hit, share);
         }
+        let shaded = met.iter().skip(stride / 2).step_by(stride);
+        self.coat(shaded, coverage, |times| (0..(n * n * times * times)).filter_map(|i| meet(n * times, i)).collect());
         self.collect();
         Pixel { values: self.values, coverage, depth: depth / hits, normal: normal.normalize_or_zero() }
     }
@@ -192,11 +197,68 @@ impl<'a, const N: usize> Gather<'a, N> {
         }
     }
 
-    /// Lights mirrored in the coat.
-    fn coat(&mut self, ray: Ray, hit: &Hit, share: f32) {
-        let Some(coat) = self.bulk.scene.material.coat else { return };
-        let normal = self.bulk.scene.geometry.shading_normal(hit);
-        self.reflect(hit, share, |direction| coat.evaluate(-ray.direction, direction, normal).0);
+    /// Lights mirrored in the coat; lamps whose highlight has an edge here are looked at with more rays, of which `finer` makes so many
+    /// times more per axis.
+    fn coat<'h>(
+        &mut self,
+        shaded: impl Iterator<Item = &'h (Ray, Hit)>,
+        coverage: f32,
+        finer: impl Fn(u32) -> Vec<(Ray, Hit)>,
+    ) {
+        let bulk = self.bulk;
+        let Some(coat) = bulk.scene.material.coat else { return };
+        let geometry = &bulk.scene.geometry;
+        let hits: Vec<(Ray, Hit, Vec3)> = shaded.map(|(ray, hit)| (*ray, *hit, geometry.shading_normal(hit))).collect();
+        let radiance = |l: usize, ray: &Ray, hit: &Hit, normal: Vec3| {
+            let shine = bulk.lamps.shine(l, hit.position);
+            match shine.direction.dot(hit.normal) > 0.0 {
+                true => coat.evaluate(-ray.direction, shine.direction, normal).0 * shine.factor,
+                false => Vec3::ZERO,
+            }
+        };
+        let lit = |l: usize, hit: &Hit, value: Vec3| {
+            // Written so that NaN fails it.
+            value.max_element() > INVISIBLE && {
+                let shine = bulk.lamps.shine(l, hit.position);
+                let facing = Facing::Entering;
+                !geometry.occluded(hit.position, shine.direction, shine.distance, facing, hit.primitive)
+            }
+        };
+        let mut fine: [Option<Vec<(Ray, Hit, Vec3)>>; SHARP.len()] = [const { None }; SHARP.len()];
+        let mut values = Vec::with_capacity(hits.len());
+        for l in 0..bulk.lamps.len() {
+            values.clear();
+            values.extend(hits.iter().map(|(ray, hit, normal)| radiance(l, ray, hit, *normal)));
+            let brightness = values.iter().map(|v| v.max_element());
+            let (least, most) = brightness.fold((f32::MAX, 0.0f32), |(a, b), v| (a.min(v), b.max(v)));
+            let level = SHARP.iter().rposition(|(contrast, _)| most - least > *contrast);
+            let mut sum = Vec3::ZERO;
+            let count = match level {
+                None => {
+                    for ((_, hit, _), value) in hits.iter().zip(&values) {
+                        if lit(l, hit, *value) {
+                            sum += *value;
+                        }
+                    }
+                    hits.len()
+                }
+                Some(level) => {
+                    let made = || {
+                        let all = finer(SHARP[level].1).into_iter();
+                        all.map(|(ray, hit)| (ray, hit, geometry.shading_normal(&hit))).collect()
+                    };
+                    let rays = fine[level].get_or_insert_with(made);
+                    for (ray, hit, normal) in rays.iter() {
+                        let value = radiance(l, ray, hit, *normal);
+                        if lit(l, hit, value) {
+                            sum += value;
+                        }
+                    }
+                    rays.len()
+                }
+            };
+            self.add(l, sum * (coverage / count.max(1) as f32));
+        }
     }
 
     /// Light that comes straight from the lamps and leaves by `reflectance` (scattering function times cosine).
