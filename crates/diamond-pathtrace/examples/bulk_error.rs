@@ -9,7 +9,7 @@ use diamond_image::Transfer;
 use diamond_light::LightRig;
 use diamond_pathtrace::{
     Boundary, Bulk, BulkError, BulkOptions, Coat, Geometry, Light, Material, Medium, Mesh, ReferenceImage,
-    ReferenceOptions, Scene, render_reference,
+    ReferenceOptions, Scene, reference_pairs,
 };
 use glam::Vec3;
 use std::error::Error;
@@ -97,13 +97,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         };
         let cameras = cameras(side);
         let start = Instant::now();
-        let references = cameras
-            .iter()
-            .enumerate()
-            .map(|(i, camera)| {
-                render_reference(&scene, camera, &ReferenceOptions { samples, seed: i as u64, ..Default::default() })
-            })
-            .collect::<Result<Vec<_>, _>>()?;
+        let options = ReferenceOptions { samples, ..Default::default() };
+        let references = reference_pairs(&scene, &cameras, &options)?;
         println!(
             "{name}: reference {} views × 16 lights, {samples} paths: {:.1} s",
             cameras.len(),
@@ -161,7 +156,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             if setting == "base" && arguments.len() > 3 {
                 std::fs::write(
                     format!("{name}-{}", arguments[3]),
-                    picture(&references[0], &view.lights, &[0, 5, 10, 15]),
+                    picture(&references[0][0], &view.lights, &[0, 5, 10, 15]),
                 )?;
             }
         }

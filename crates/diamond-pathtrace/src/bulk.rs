@@ -36,7 +36,7 @@ mod points;
 mod refracting;
 mod render;
 
-pub use measure::{BulkError, measure_bulk};
+pub use measure::{BulkError, ReferencePair, measure_bulk, reference_pairs};
 pub use render::BulkView;
 
 use crate::error::check;

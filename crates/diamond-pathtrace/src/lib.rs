@@ -57,7 +57,7 @@ mod sobol;
 mod triangle;
 
 pub use boundary::{Boundary, BoundarySample};
-pub use bulk::{Bulk, BulkError, BulkOptions, BulkView, measure_bulk};
+pub use bulk::{Bulk, BulkError, BulkOptions, BulkView, ReferencePair, measure_bulk, reference_pairs};
 pub use coat::Coat;
 pub use distance_field::{DistanceField, Operation, Solid, SurfaceNoise, smooth_minimum};
 pub use environment::{Environment, EnvironmentMap};

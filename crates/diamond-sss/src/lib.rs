@@ -15,6 +15,7 @@
 //! ```
 mod camera_path;
 mod capture_check;
+mod contact_sheet;
 mod error;
 mod evaluation;
 mod export;
@@ -36,6 +37,7 @@ mod training_log;
 
 pub use camera_path::{CameraChoice, cameras_of, parse_cameras, read_cameras};
 pub use capture_check::open_capture;
+pub use contact_sheet::{SheetOptions, contact_sheet, family_sheet};
 pub use error::SssError;
 pub use evaluation::{FittedGain, HeldOutGain, ImageScore, PSNR_CAP, Scored, evaluate_model};
 pub use export::{ExportOptions, Exported, convert_splats, export_model, is_splat_file, parse_turn};

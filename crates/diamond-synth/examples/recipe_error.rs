@@ -4,7 +4,7 @@
 //!
 //! PATHS of the reference per pixel. KEY=VALUE changes all recipes, such as `quality.walks=4096`. With a folder, a picture for each recipe: reference, bulk, and ten times their difference (grey is none).
 use diamond_image::{Image, Transfer};
-use diamond_pathtrace::{Bulk, BulkError, ReferenceImage, render_reference};
+use diamond_pathtrace::{Bulk, BulkError, ReferenceImage, reference_pairs};
 use diamond_synth::{Measurement, Object, Plan, Recipe};
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -47,24 +47,16 @@ fn main() -> Result<(), Box<dyn Error>> {
     arguments.retain(|a| !a.contains('='));
     let (paths, files) = arguments.split_first().ok_or("expected PATHS and recipes")?;
     println!(
-        "| recipe | points × walks | bias % | ± | RMSE % | systematic % | noise % | noise dB | solve s | view s | reference s |"
+        "| recipe | points × walks | bias % | ± | RMSE % | RMSE below % | systematic % | noise % | noise dB | solve s | view s | reference s |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
     for file in files {
         let mut recipe = Recipe::parse_changed(&std::fs::read_to_string(file)?, file, &changes)?;
         recipe.quality.measured_paths = paths.parse()?;
         let object = Object::new(&recipe, Path::new(file).parent().unwrap_or(Path::new("")))?;
         let m = Measurement::new(&recipe, &object, &Plan::new(&recipe)?);
         let start = Instant::now();
-        let references: Vec<ReferenceImage> = m
-            .cameras
-            .iter()
-            .zip(0..)
-            .map(|(camera, i)| {
-                let options = diamond_pathtrace::ReferenceOptions { seed: m.reference.seed + i, ..m.reference };
-                render_reference(&m.scene, camera, &options)
-            })
-            .collect::<Result<_, _>>()?;
+        let references = reference_pairs(&m.scene, &m.cameras, &m.reference)?;
         let reference = start.elapsed().as_secs_f32();
         let start = Instant::now();
         let bulk = Bulk::solve(&m.scene, &m.bulk, &|_| ())?;
@@ -74,13 +66,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         let rendered = start.elapsed().as_secs_f32();
         let e = BulkError::against(&m.scene, &m.bulk, &m.cameras, &references, &|_| ())?;
         println!(
-            "| {} | {} × {} | {:+.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.1} | {solve:.1} | {rendered:.2} | {reference:.0} |",
+            "| {} | {} × {} | {:+.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.1} | {solve:.1} | {rendered:.2} | {reference:.0} |",
             recipe.name,
             bulk.points(),
             m.bulk.walks,
             100.0 * e.bias,
             100.0 * e.bias_standard_error.hypot(e.bias_noise),
             100.0 * e.rmse,
+            100.0 * (e.rmse * e.rmse + 2.0 * e.square_standard_error).sqrt(),
             100.0 * e.systematic(),
             100.0 * e.noise,
             e.noise_db,
@@ -88,7 +81,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         if let Some(folder) = &folder {
             std::fs::create_dir_all(folder)?;
             let stem = Path::new(file).file_stem().unwrap_or_default();
-            std::fs::write(folder.join(stem).with_extension("ppm"), picture(&references[0], &view.lights))?;
+            std::fs::write(folder.join(stem).with_extension("ppm"), picture(&references[0][0], &view.lights))?;
         }
     }
     Ok(())

@@ -13,6 +13,7 @@ mod measure;
 mod object;
 mod plan;
 mod recipe;
+mod shards;
 
 pub use capture::{CaptureRecord, Progress, Stage, synthesize};
 pub use changes::changed_table;
@@ -25,3 +26,4 @@ pub use recipe::{
     BoundaryRecipe, CoatRecipe, FilmRecipe, HeldOutRecipe, MaterialRecipe, NoiseRecipe, ObjectRecipe, Part,
     QualityRecipe, Recipe, RigKind, RigRecipe, SolidRecipe, UpAxis,
 };
+pub use shards::{ShardEntry, ShardIndex, ShardOptions, export_shards};

@@ -100,7 +100,7 @@ pub const PACKAGES: &[Package] = &[
     Package { name: "diamond-losses", floor: 2, outside: Some(&["libm"]), optional: &[], alone: Some(SIMD) },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
-    heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2"]),
+    heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2", "safetensors", "half"]),
     heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
     heavy(
         "diamond-sss",

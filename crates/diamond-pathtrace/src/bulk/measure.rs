@@ -14,8 +14,11 @@ pub struct BulkError {
     /// What two solutions with half the walks differ by in the mean, halved: the size of the bulk solution's own part in `bias`
     /// (walks are shared by all pixels and lamps, so it does not average out over them).
     pub bias_noise: f64,
-    /// Root of the mean squared difference from the reference, without the reference's own noise, over the mean radiance.
+    /// Root of the mean squared difference from the truth, over the mean radiance. The truth is known by two independent references, and the
+    /// product of the differences from both has no part of either's noise in the mean (0 where it is negative).
     pub rmse: f64,
+    /// Standard error of the square of `rmse`, pixels taken as independent.
+    pub square_standard_error: f64,
     /// The same over the root mean square of the reference.
     pub rmse_of_rms: f64,
     /// Root mean square noise of the bulk pictures over the mean radiance, from two solutions with half the walks.
@@ -45,7 +48,31 @@ fn peak(image: &Image, coverage: &Image) -> f64 {
     values.get(at.min(values.len().saturating_sub(1))).map_or(0.0, |v| f64::from(*v)).max(1e-30)
 }
 
-/// Solves and renders `cameras` in bulk and by [`render_reference`], and compares; two more solutions with half the walks and other
+/// Two independent references of a view, each with half the paths.
+pub type ReferencePair = [crate::ReferenceImage; 2];
+
+/// The references that [`BulkError::against`] wants, each with half of `options.samples` paths per pixel.
+///
+/// # Errors
+/// As [`render_reference`].
+pub fn reference_pairs(
+    scene: &Scene,
+    cameras: &[Camera],
+    options: &ReferenceOptions,
+) -> Result<Vec<ReferencePair>, PathtraceError> {
+    let half =
+        |seed: u64| ReferenceOptions { samples: (options.samples / 2).max(2), seed, ..*options };
+    let pair = |(i, camera): (usize, &Camera)| {
+        let seed = options.seed.wrapping_add(2 * i as u64);
+        Ok([
+            render_reference(scene, camera, &half(seed))?,
+            render_reference(scene, camera, &half(seed.wrapping_add(1)))?,
+        ])
+    };
+    cameras.iter().enumerate().map(pair).collect()
+}
+
+/// Solves and renders `cameras` in bulk and by [`reference_pairs`], and compares; two more solutions with half the walks and other
 /// seeds measure the noise, each half as good as the whole in variance.
 pub fn measure_bulk(
     scene: &Scene,
@@ -54,13 +81,7 @@ pub fn measure_bulk(
     reference: &ReferenceOptions,
     progress: &(dyn Fn(f32) + Sync),
 ) -> Result<BulkError, PathtraceError> {
-    let references = cameras
-        .iter()
-        .enumerate()
-        .map(|(i, camera)| {
-            render_reference(scene, camera, &ReferenceOptions { seed: reference.seed + i as u64, ..*reference })
-        })
-        .collect::<Result<Vec<_>, _>>()?;
+    let references = reference_pairs(scene, cameras, reference)?;
     BulkError::against(scene, options, cameras, &references, progress)
 }
 
@@ -70,7 +91,7 @@ impl BulkError {
         scene: &Scene,
         options: &BulkOptions,
         cameras: &[Camera],
-        references: &[crate::ReferenceImage],
+        references: &[ReferencePair],
         progress: &(dyn Fn(f32) + Sync),
     ) -> Result<Self, PathtraceError> {
         if cameras.len() != references.len() || cameras.is_empty() {
@@ -85,31 +106,36 @@ impl BulkError {
         let first = Bulk::solve(scene, &halved(options.seed.wrapping_add(1)), &|f| progress(0.5 + f * 0.25))?;
         let second = Bulk::solve(scene, &halved(options.seed.wrapping_add(2)), &|f| progress(0.75 + f * 0.25))?;
         let (mut sum, mut reference_sum, mut reference_square) = (0.0f64, 0.0f64, 0.0f64);
-        let (mut squares, mut own, mut noise, mut relative, mut n) = (0.0f64, 0.0f64, 0.0f64, 0.0f64, 0usize);
+        let (mut squares, mut noise, mut relative, mut n) = (0.0f64, 0.0f64, 0.0f64, 0usize);
+        // Of a pixel's squared differences, all lamps and channels together.
+        let mut pixel_squares = 0.0f64;
         let (mut spread, mut apart) = (0.0f64, 0.0f64);
         let mut pictures = 0usize;
-        for (v, (camera, reference)) in cameras.iter().zip(references).enumerate() {
+        for (v, (camera, [one, two])) in cameras.iter().zip(references).enumerate() {
             let view = whole.render(camera, v as u64)?;
             let (a, b) = (first.render(camera, 1000 + v as u64)?, second.render(camera, 2000 + v as u64)?);
             // Lamps share paths: their errors add up, pixels' do not.
             let mut pixel_error = vec![0.0f64; view.coverage.pixels()];
+            let mut pixel_square = vec![0.0f64; view.coverage.pixels()];
             for (l, image) in view.lights.iter().enumerate() {
-                let target = &reference.lights[l];
+                let (one_light, two_light) = (&one.lights[l], &two.lights[l]);
                 let peak = peak(image, &view.coverage);
                 let (mut here, mut here_n) = (0.0f64, 0usize);
-                for (i, covered) in reference.coverage.data().iter().enumerate() {
-                    if *covered <= 0.0 && view.coverage.data()[i] <= 0.0 {
+                for (i, covered) in view.coverage.data().iter().enumerate() {
+                    if *covered <= 0.0 && one.coverage.data()[i] <= 0.0 && two.coverage.data()[i] <= 0.0 {
                         continue;
                     }
                     for k in 3 * i..3 * i + 3 {
-                        let (x, r) = (f64::from(image.data()[k]), f64::from(target.mean.data()[k]));
-                        let e = f64::from(target.standard_error.data()[k]);
+                        let x = f64::from(image.data()[k]);
+                        let (p, q) = (f64::from(one_light.mean.data()[k]), f64::from(two_light.mean.data()[k]));
+                        let errors = (one_light.standard_error.data()[k], two_light.standard_error.data()[k]);
+                        let (r, e) = (0.5 * (p + q), 0.5 * f64::from(errors.0).hypot(f64::from(errors.1)));
                         let half = f64::from(a.lights[l].data()[k] - b.lights[l].data()[k]);
                         sum += x;
                         reference_sum += r;
-                        reference_square += r * r;
-                        squares += (x - r) * (x - r);
-                        own += e * e;
+                        reference_square += p * q;
+                        squares += (x - p) * (x - q);
+                        pixel_square[i] += (x - p) * (x - q);
                         pixel_error[i] += e;
                         apart += half;
                         // Var(a − b) = 2·Var(half) = 4·Var(whole).
@@ -123,16 +149,18 @@ impl BulkError {
                 pictures += 1;
             }
             spread += pixel_error.iter().map(|e| e * e).sum::<f64>();
+            pixel_squares += pixel_square.iter().map(|e| e * e).sum::<f64>();
         }
         let n = n.max(1) as f64;
         let mean = (reference_sum / n).max(1e-30);
-        let rms = (reference_square / n).sqrt().max(1e-30);
-        let error = ((squares - own) / n).max(0.0).sqrt();
+        let rms = (reference_square / n).max(0.0).sqrt().max(1e-30);
+        let error = (squares / n).max(0.0).sqrt();
         Ok(Self {
             bias: sum / reference_sum.max(1e-30) - 1.0,
             bias_standard_error: spread.sqrt() / reference_sum.max(1e-30),
             bias_noise: 0.5 * apart.abs() / reference_sum.max(1e-30),
             rmse: error / mean,
+            square_standard_error: pixel_squares.sqrt() / (n * mean * mean),
             rmse_of_rms: error / rms,
             noise: (noise / n).sqrt() / mean,
             noise_db: -10.0 * (relative / pictures.max(1) as f64).max(1e-30).log10(),

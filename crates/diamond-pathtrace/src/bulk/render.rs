@@ -27,6 +27,9 @@ const EDGE: u32 = 3;
 /// axis: a polished coat shows a lamp smaller than a pixel.
 const SHARP: [(f32, u32); 2] = [(0.01, 3), (0.2, 8)];
 
+/// Places of single scattering along each stretch of a camera ray.
+const PLACES: u32 = 4;
+
 /// The golden ratio's fractional part: its multiples fill the unit interval evenly, however many there are.
 const STEP: f32 = 0.618_034;
 
@@ -322,21 +325,23 @@ impl Gather<'_, HEMISPHERE> {
         self.weights = weights;
     }
 
-    /// Light that was scattered once, at one place of the stretch.
+    /// Light that was scattered once, at a few places of the stretch.
     /// `[eq:single-scattering]`
     fn once(&mut self, hit: &Hit, direction: Vec3, length: f32, weight: Vec3) {
         let bulk = self.bulk;
         let medium = bulk.scene.material.medium;
-        self.sequence += STEP;
-        self.sequence -= self.sequence.floor();
-        let (distance, ratio) = forced_flight_quantile(medium.sigma_t, length, self.sequence);
-        let at = hit.position + direction * distance;
-        let weight = weight * ratio * medium.albedo;
-        for l in 0..bulk.lamps.len() {
-            let shine = bulk.lamps.shine(l, at);
-            let inside = bulk.maps.inside_length(l, at, &shine);
-            let phase = henyey_greenstein(medium.g, direction, shine.direction);
-            self.add(l, weight * medium.transmittance(inside) * (phase * shine.factor));
+        for _ in 0..PLACES {
+            self.sequence += STEP;
+            self.sequence -= self.sequence.floor();
+            let (distance, ratio) = forced_flight_quantile(medium.sigma_t, length, self.sequence);
+            let at = hit.position + direction * distance;
+            let weight = weight * ratio * medium.albedo / PLACES as f32;
+            for l in 0..bulk.lamps.len() {
+                let shine = bulk.lamps.shine(l, at);
+                let inside = bulk.maps.inside_length(l, at, &shine);
+                let phase = henyey_greenstein(medium.g, direction, shine.direction);
+                self.add(l, weight * medium.transmittance(inside) * (phase * shine.factor));
+            }
         }
     }
 }

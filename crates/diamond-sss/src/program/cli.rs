@@ -113,18 +113,48 @@ says otherwise. PLY customarily has y down,\nSPZ and glTF have y up: --turn x:18
     /// Render a synthetic capture from a recipe, with its error measured against an unbiased path tracer
     #[command(after_help = "Examples:
   diamond synth assets/recipes/wax-candle.toml -o candle
-  diamond synth assets/recipes/training-family.toml -o family --members 10
+  diamond synth assets/recipes/jade-figure.toml -o jade rig.views=100 rig.lights=112 --contact-sheet jade.png
+  diamond synth assets/recipes/training-family.toml -o family --members 10 --shards shards
+  diamond synth assets/recipes/mesh.toml -o mine object.path=/data/mine.glb material.g=0.5
 
-Whoever is interrupted goes on with the same command. Two runs give the same bytes.")]
+Whoever is interrupted goes on with the same command. Two runs give the same bytes.
+docs/captures.md says what a recipe can say and what is written.")]
     Synth {
         /// A recipe (TOML), or a family of recipes
         recipe: PathBuf,
+        /// Changes to the recipe, such as rig.views=8, film.resolution=64, quality.walks=512
+        #[arg(value_name = "KEY=VALUE")]
+        changes: Vec<String>,
         /// The capture's folder, which must not exist; of a family, the folder of its captures
         #[arg(short, long)]
         output: PathBuf,
         /// Of a family: only the first so many members
         #[arg(long, value_name = "COUNT")]
         members: Option<u32>,
+        /// Also draw many small pictures on one (PNG): views by lights, members of a family by views
+        #[arg(long, value_name = "FILE")]
+        contact_sheet: Option<PathBuf>,
+        /// Also write all images as safetensors shards into this folder, see `diamond shards`
+        #[arg(long, value_name = "DIR")]
+        shards: Option<PathBuf>,
+    },
+    /// Write captures as safetensors shards of half floats, for training by other programs
+    #[command(after_help = "Examples:
+  diamond shards candle -o shards
+  diamond shards family/* -o shards --shard-size 32MiB
+
+index.json in the folder lists the shards; docs/captures.md has their layout and how to read them in Python.
+Shards that are there are kept, so the same command goes on after an interruption.")]
+    Shards {
+        /// The captures, whose folders must have different names
+        #[arg(required = true)]
+        captures: Vec<PathBuf>,
+        /// Folder for the shards
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Size of a shard at most; a view with all its lights is not cut
+        #[arg(long, value_name = "SIZE", default_value = "64MiB")]
+        shard_size: ByteSize,
     },
     /// List the presets, or print one as TOML to start a configuration from
     #[command(after_help = "Examples:\n  diamond presets\n  diamond presets resolved > mine.toml")]

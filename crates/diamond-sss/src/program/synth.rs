@@ -1,17 +1,35 @@
-//! `diamond synth`: captures from recipes.
+//! `diamond synth`: captures from recipes; `diamond shards`: captures for other programs.
 use super::progress::Counter;
 use super::{complain, print};
-use diamond_sss::SssError;
-use diamond_synth::{CaptureRecord, Family, Progress, Recipe, Stage, synthesize};
+use diamond_dataset::{Capture, OpenOptions};
+use diamond_sss::{SheetOptions, SssError, contact_sheet, family_sheet, write_output};
+use diamond_synth::{CaptureRecord, Family, Progress, Recipe, ShardOptions, Stage, export_shards, synthesize};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 /// Progress within a stage is shown in so many parts.
 const PARTS: f32 = 1000.0;
 
-/// Makes the capture of a recipe, or those of a family.
-pub fn run(file: PathBuf, output: PathBuf, members: Option<u32>) -> Result<(), SssError> {
-    let text = std::fs::read_to_string(&file).map_err(|source| SssError::Io {
+/// What is asked for.
+pub struct Wish {
+    /// A recipe or a family.
+    pub recipe: PathBuf,
+    /// Changes to it.
+    pub changes: Vec<String>,
+    /// Folder of the capture, or of the family's captures.
+    pub output: PathBuf,
+    /// Only the first members.
+    pub members: Option<u32>,
+    /// Where many small pictures go.
+    pub contact_sheet: Option<PathBuf>,
+    /// Where shards go.
+    pub shards: Option<PathBuf>,
+}
+
+/// Makes the capture of a recipe, or those of a family, and what else is asked for. Captures of a family that are there are kept.
+pub fn run(wish: &Wish) -> Result<(), SssError> {
+    let file = &wish.recipe;
+    let text = std::fs::read_to_string(file).map_err(|source| SssError::Io {
         path: file.clone(),
         action: "read the recipe",
         source,
@@ -19,21 +37,51 @@ pub fn run(file: PathBuf, output: PathBuf, members: Option<u32>) -> Result<(), S
     let origin = file.display().to_string();
     let folder = file.parent().unwrap_or(Path::new(""));
     let is_family = toml::from_str::<toml::Table>(&text).is_ok_and(|table| table.contains_key("count"));
-    if !is_family {
-        if members.is_some() {
+    let mut captures = Vec::new();
+    if is_family {
+        let family = Family::parse_changed(&text, &origin, &wish.changes)?;
+        let count = wish.members.unwrap_or(family.count).min(family.count);
+        for index in 0..count {
+            let capture = wish.output.join(format!("{index:04}"));
+            if !capture.exists() {
+                print(&format!("member {} of {count}\n", index + 1));
+                make(&family.member(index), folder, &capture)?;
+            }
+            captures.push(capture);
+        }
+    } else {
+        if wish.members.is_some() {
             return Err(SssError::Usage("--members is for families (recipes with `count`)".into()));
         }
-        let recipe = Recipe::parse(&text, &origin)?;
-        return make(&recipe, folder, &output).map(drop);
+        let recipe = Recipe::parse_changed(&text, &origin, &wish.changes)?;
+        make(&recipe, folder, &wish.output)?;
+        captures.push(wish.output.clone());
     }
-    let family = Family::parse(&text, &origin)?;
-    for index in 0..members.unwrap_or(family.count).min(family.count) {
-        let capture = output.join(format!("{index:04}"));
-        if capture.exists() {
-            continue;
-        }
-        make(&family.member(index), folder, &capture)?;
+    if let Some(path) = &wish.contact_sheet {
+        let opened: Vec<Capture> =
+            captures.iter().map(|path| Capture::open(path, &OpenOptions::default())).collect::<Result<_, _>>()?;
+        let options = SheetOptions::default();
+        let png = match (is_family, opened.first()) {
+            (false, Some(capture)) => contact_sheet(capture, &options)?,
+            _ => family_sheet(&opened, &options)?,
+        };
+        write_output(path, &png)?;
+        print(&format!("written: {}\n", path.display()));
     }
+    match &wish.shards {
+        Some(output) => shards(&captures, output, ShardOptions::default().bytes),
+        None => Ok(()),
+    }
+}
+
+/// Writes captures as shards.
+pub fn shards(captures: &[PathBuf], output: &Path, bytes: u64) -> Result<(), SssError> {
+    let counter = Mutex::new(Counter::new("shards"));
+    let told = |done, all| counter.lock().unwrap_or_else(PoisonError::into_inner).show(done, all);
+    let index = export_shards(captures, output, &ShardOptions { bytes }, &told)?;
+    counter.lock().unwrap_or_else(PoisonError::into_inner).finish();
+    let size = index.shards.iter().map(|s| s.bytes).sum::<u64>() as f64 / 1e6;
+    print(&format!("{}: {} shards, {size:.1} MB\n", output.display(), index.shards.len()));
     Ok(())
 }
 
