@@ -30,10 +30,10 @@ pub enum Difference {
 impl fmt::Display for Difference {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Difference::Missing(path) => write!(f, "{path}: listed in {MANIFEST} and not there"),
-            Difference::Changed(path) => write!(f, "{path}: its bytes are not those of {MANIFEST}"),
+            Difference::Missing(path) => write!(f, "{path}: expected and not there"),
+            Difference::Changed(path) => write!(f, "{path}: its bytes are not those that are expected"),
             Difference::Unlisted(path) => {
-                write!(f, "{path}: not in {MANIFEST}; if it belongs there, run `cargo xtask fixtures --update`")
+                write!(f, "{path}: not expected; if it belongs there, run `cargo xtask fixtures --update`")
             }
         }
     }

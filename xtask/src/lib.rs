@@ -3,6 +3,7 @@
 //! `cargo xtask oracle` and the cross-crate tests run the same code, so a table that passes in one passes in the other.
 
 pub mod bench;
+pub mod captures;
 pub mod fixtures;
 pub mod oracle;
 pub mod suite;

@@ -4,7 +4,7 @@ use clap::{Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use xtask::oracle::{self, OracleKind};
-use xtask::{fixtures, suite, tidy};
+use xtask::{captures, fixtures, suite, tidy};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
 const BENCHES: [&str; 2] = ["splat", "transport"];
@@ -18,6 +18,8 @@ Examples:
   cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
   cargo xtask tidy --rules                          the house rules and their reasons
   cargo xtask fixtures --update                     accept the reference files as they are now
+  cargo xtask fixtures --recipe                     render the small captures again and compare their bytes
+  cargo xtask fixtures --recipe candle-small --update
 
 Exit codes: 0 all is well, 1 a check failed, 2 wrong usage or unreadable input.";
 
@@ -60,7 +62,7 @@ enum Tool {
         #[arg(last = true)]
         rest: Vec<String>,
     },
-    /// Compare reference files and captures with their manifest of hashes.
+    /// Compare reference files and captures with their manifest of hashes, or rendered captures with new ones.
     Fixtures {
         /// Compare (the default).
         #[arg(long, conflicts_with = "update")]
@@ -68,6 +70,10 @@ enum Tool {
         /// Rewrite the manifest from the files as they are.
         #[arg(long)]
         update: bool,
+        /// Render captures of assets/captures/captures.toml again and compare bytes (with --update: replace them); all of them
+        /// without names.
+        #[arg(long, value_name = "NAME", num_args = 0..)]
+        recipe: Option<Vec<String>>,
     },
 }
 
@@ -108,6 +114,23 @@ fn run(tool: Tool) -> Result<bool, String> {
         Tool::Bench { name, rest } => {
             let arguments = ["bench", "--quiet", "--package", "xtask", "--bench", &name, "--"];
             suite::cargo(root, &arguments.into_iter().chain(rest.iter().map(String::as_str)).collect::<Vec<_>>())
+        }
+        Tool::Fixtures { update, recipe: Some(names), .. } => {
+            let mut same = true;
+            for capture in captures::chosen(root, &names)? {
+                if update {
+                    println!("{}: {} files", capture.name, capture.update(root)?);
+                    continue;
+                }
+                let (count, differences) = capture.check(root)?;
+                differences.iter().for_each(|difference| println!("{difference}"));
+                println!("{}: {count} files rendered again, {} differences", capture.name, differences.len());
+                same &= differences.is_empty();
+            }
+            if update {
+                println!("{}: {} files", fixtures::MANIFEST, fixtures::update(root)?);
+            }
+            Ok(same)
         }
         Tool::Fixtures { update: true, .. } => {
             let count = fixtures::update(root)?;

@@ -76,7 +76,8 @@ pub fn contact_sheet(capture: &Capture, options: &SheetOptions) -> Result<Vec<u8
     sheet(&rows, options.side)
 }
 
-/// PNG of several captures, a row for each: another view and another light in each column.
+/// PNG of several captures, a row for each: another view and another light in each column (on domes, light `k` stands near camera `k`, so they do
+/// not go together).
 ///
 /// # Errors
 /// Images that cannot be read.
@@ -87,7 +88,7 @@ pub fn family_sheet(captures: &[Capture], options: &SheetOptions) -> Result<Vec<
         .map(|&i| {
             let views = &captures[i].train;
             let columns = spread(views.len(), options.columns).enumerate();
-            columns.map(|(k, v)| small(&captures[i], &views[v], k % views[v].shots.len(), options.side)).collect()
+            columns.map(|(k, v)| small(&captures[i], &views[v], (3 * k + 1) % views[v].shots.len(), options.side)).collect()
         })
         .collect::<Result<_, SssError>>()?;
     sheet(&rows, options.side)

@@ -37,10 +37,11 @@ impl Object {
             }
             ObjectRecipe::Solids { cells, .. } | ObjectRecipe::Random { cells, .. } => {
                 let mesh = recipe.object.field().map(|field| field.polygonise(*cells)).transpose()?;
-                // Blends and noise may reach beyond the ball.
+                // Blends and noise may reach beyond the ball, and random objects should fill it.
                 let mesh = mesh.unwrap_or_default();
                 let farthest = mesh.positions.iter().map(|p| p.length()).fold(0.0, f32::max);
-                if farthest > 1.0 { mesh.fitted(Vec3::ZERO, 1.0) } else { mesh }
+                let is_random = matches!(recipe.object, ObjectRecipe::Random { .. });
+                if farthest > 1.0 || is_random { mesh.fitted(Vec3::ZERO, 1.0) } else { mesh }
             }
         };
         let (mut mesh, repairs) = mesh.repair(&RepairOptions::default())?;
