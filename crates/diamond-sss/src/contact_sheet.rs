@@ -88,7 +88,9 @@ pub fn family_sheet(captures: &[Capture], options: &SheetOptions) -> Result<Vec<
         .map(|&i| {
             let views = &captures[i].train;
             let columns = spread(views.len(), options.columns).enumerate();
-            columns.map(|(k, v)| small(&captures[i], &views[v], (3 * k + 1) % views[v].shots.len(), options.side)).collect()
+            columns
+                .map(|(k, v)| small(&captures[i], &views[v], (3 * k + 1) % views[v].shots.len(), options.side))
+                .collect()
         })
         .collect::<Result<_, SssError>>()?;
     sheet(&rows, options.side)
