@@ -1,7 +1,8 @@
 //! Time of one view under 1, 2, 4, … lights: what a further light costs beside the first.
 //! `cargo run --release -p diamond-reconstruct --example light_scaling -- CAPTURE [STEPS [WIDTH]]` trains briefly first; given the
-//! folder of a finished run instead of a capture, it renders that model from a camera of its own. Times are of the
-//! processors, all threads together, where the system tells (Linux): other programs on the machine lengthen wall time.
+//! folder of a finished run instead of a capture, it renders that model from a camera of its own. Of each repetition it
+//! takes the time of the processors, all threads together, where the system tells (Linux), and wall time; it shows the
+//! median of the former and the least of the latter, which other programs on the machine lengthen.
 use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_dataset::{Capture, OpenOptions};
 use diamond_light::OlatLight;
@@ -25,18 +26,29 @@ fn processor_seconds() -> Option<f64> {
     Some(nanoseconds as f64 * 1e-9)
 }
 
-fn median(mut f: impl FnMut() -> Result<(), Failure>) -> Result<f64, Failure> {
-    let mut times = Vec::new();
+/// What something took, milliseconds.
+#[derive(Clone, Copy)]
+struct Time {
+    /// All threads together, the median of the repetitions.
+    processors: f64,
+    /// The least of the repetitions.
+    wall: f64,
+}
+
+fn time(mut f: impl FnMut() -> Result<(), Failure>) -> Result<Time, Failure> {
+    let (mut times, mut wall) = (Vec::new(), f64::INFINITY);
     for _ in 0..REPETITIONS {
         let (start, processors) = (Instant::now(), processor_seconds());
         f()?;
+        let passed = start.elapsed().as_secs_f64();
+        wall = wall.min(1e3 * passed);
         times.push(match (processors, processor_seconds()) {
             (Some(before), Some(after)) => after - before,
-            _ => start.elapsed().as_secs_f64(),
+            _ => passed,
         });
     }
     times.sort_by(f64::total_cmp);
-    Ok(1e3 * times[REPETITIONS / 2])
+    Ok(Time { processors: 1e3 * times[REPETITIONS / 2], wall })
 }
 
 /// `n` directions spread evenly over the sphere.
@@ -76,18 +88,22 @@ fn main() -> Result<(), Failure> {
         .map(|d| OlatLight::Point { position: model.scene.centre() + distance * d, intensity: Vec3::ONE })
         .collect();
     println!("{:?}", Renderer::new(&model).work(&camera, 112)?);
+    println!("                       processors    × one   each         wall    × one   each");
     // A renderer for each repetition: what it does once per model counts too.
-    let one = median(|| Ok(Renderer::new(&model).radiance(&camera, &lights[..1]).map(drop)?))?;
+    let of = |model: &Model, n: usize| time(|| Ok(Renderer::new(model).radiance(&camera, &lights[..n]).map(drop)?));
+    let show = |what: &str, n: usize, one: Time, all: Time| {
+        let column = |one: f64, all: f64| format!("{all:8.2} ms {:7.2} {:7.3}", all / one, all / n as f64);
+        println!("{n:4} lights{what:8} {}  {}", column(one.processors, all.processors), column(one.wall, all.wall));
+    };
+    let one = of(&model, 1)?;
     for n in [1, 4, 16, 112] {
-        let time = median(|| Ok(Renderer::new(&model).radiance(&camera, &lights[..n]).map(drop)?))?;
-        println!("{n:4} lights {time:8.2} ms  {:6.2} × one light  {:6.3} ms each", time / one, time / n as f64);
+        show("", n, one, of(&model, n)?);
     }
     let mut untraced = model.clone();
     untraced.config.visibility.traced = false;
-    let of = |n: usize| median(|| Ok(Renderer::new(&untraced).radiance(&camera, &lights[..n]).map(drop)?));
-    let (first, all) = (of(1)?, of(112)?);
-    println!("with fitted visibility, 1 light {first:8.2} ms, 112 lights {all:8.2} ms, {:6.2} ×", all / first);
-    let maps = median(|| Ok(Renderer::new(&model).renderings(&camera, &lights[..1]).map(drop)?))?;
-    println!("   1 light with all maps {maps:8.2} ms");
+    let one = of(&untraced, 1)?;
+    show(" fitted", 112, one, of(&untraced, 112)?);
+    let maps = time(|| Ok(Renderer::new(&model).renderings(&camera, &lights[..1]).map(drop)?))?;
+    println!("   1 light with all maps {:8.2} ms, wall {:8.2} ms", maps.processors, maps.wall);
     Ok(())
 }

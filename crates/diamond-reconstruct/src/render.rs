@@ -13,16 +13,15 @@ use crate::forward::{Settings, raster_config};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{
-    LightRows, Rows, Transported, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
+    LightRows, Rows, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
 };
 use crate::visibility_cache::Tracer;
 use crate::{Activated, CaptureFacts, Model, Needs, ReconstructError, Rendering, error};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
-use diamond_shading::{
-    GBuffer, ManyLights, Prepared, Shaded, ShadedMaps, TransportChannels, channel, transfer_radiance,
-};
+use diamond_shading::{GBuffer, LightChannels, LitRows, Prepared, Shaded, ShadedMaps, TransportChannels, channel};
+use diamond_simd::Level;
 use diamond_splat::{Features, Projection, Raster, RasterGrad, project, rasterize_projected};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -96,12 +95,7 @@ impl<'m> Renderer<'m> {
             let (width, height) = view.size;
             let per_light = view.per_light.count();
             let images = lights.par_iter().enumerate().map(|(k, light)| {
-                let at = |c: usize| view.per_light.place(c).map(|p| k * per_light + p);
-                let channels = TransportChannels {
-                    residual: at(channel::RESIDUAL.start),
-                    incident: at(channel::INCIDENT),
-                    visibility: at(channel::VISIBILITY),
-                };
+                let channels = view.channels(k * per_light);
                 let light = self.model.scene.scaled_light(light);
                 let part = view.prepared.radiance(&light, transport, &channels).map_err(error::stage("shade"))?;
                 Ok(view.region.paste(&self.exposed(part), width, height))
@@ -191,6 +185,11 @@ impl<'m> Renderer<'m> {
             }
             _ => None,
         };
+        let scaling = input_scaling(model);
+        let transfer = transfer_config(model).filter(|_| self.needs.subsurface.needed);
+        let transfer = transfer.map(|config| (rows.transfer.as_slice(), config));
+        let lit =
+            LitRows::new(&rows.positions, network, transfer, &scaling).map_err(error::stage("transfer vectors"))?;
         let region = match Region::of_image(&raster.opacity) {
             Some(region) if !self.needs.empty_pixels.needed => region,
             _ => Region::whole(width, height),
@@ -201,7 +200,7 @@ impl<'m> Renderer<'m> {
             size: (width, height),
             projection,
             rows,
-            network,
+            lit,
             region,
             prepared,
             opacity,
@@ -239,14 +238,19 @@ impl<'m> Renderer<'m> {
         }
         let view = self.view(camera, lights.len(), layout)?;
         let gaussians = &self.activated.gaussians;
-        let per_light = view.per_light.count();
+        let mut features = Features::zeros(0, 0);
         for group in lights.chunks(self.lights_together) {
-            let computed: Vec<Lit> =
-                group.par_iter().map(|light| self.light(&view, light, layout)).collect::<Result<_, _>>()?;
-            let mut features = Features::zeros(gaussians.len(), per_light * group.len());
-            for (k, lit) in computed.iter().enumerate() {
-                lit.transported().write(&mut features, per_light * k, &view.rows.visible, &view.per_light);
+            let visibility: Vec<Vec<f32>> =
+                group.par_iter().map(|light| self.visibility(&view, light, layout)).collect::<Result<_, _>>()?;
+            let lit: Vec<(OlatLight, &[f32])> =
+                group.iter().zip(&visibility).map(|(light, v)| (*light, v.as_slice())).collect();
+            let channels = view.per_light.count() * group.len();
+            if features.channels != channels {
+                // The memory of the last group before that of this one.
+                drop(std::mem::replace(&mut features, Features::zeros(0, 0)));
+                features = Features::zeros(gaussians.len(), channels);
             }
+            view.write(&lit, &mut features)?;
             let (raster, _) =
                 rasterize_projected(&view.projection, gaussians, &features).map_err(error::stage("rasterize"))?;
             let transport = view.region.crop(&raster.features).map_err(error::stage("region"))?;
@@ -255,40 +259,21 @@ impl<'m> Renderer<'m> {
         Ok(())
     }
 
-    /// What one light adds to the rows of a view.
-    fn light(&self, view: &ViewHalf, light: &OlatLight, layout: &ChannelLayout) -> Result<Lit, ReconstructError> {
-        let (model, rows) = (self.model, &view.rows);
-        let traced;
-        let read = self.needs.visibility.needed || layout.place(channel::VISIBILITY).is_some();
-        let source = match model.config.visibility.traced {
-            _ if !read => VisibilitySource::Unread,
-            true => {
-                traced = self.tracer()?.trace_rows(
-                    &self.activated.gaussians,
-                    &self.activated.normals,
-                    light,
-                    &rows.visible,
-                )?;
-                VisibilitySource::TracedRows(&traced)
-            }
-            false => VisibilitySource::Fitted,
-        };
-        let lit = LightRows::new(model, rows, light, source)?;
-        let network = match &view.network {
-            Some(network) => {
-                let inputs = residual_inputs(model, rows, &lit);
-                let columns = inputs.light_columns(&input_scaling(model)).map_err(error::stage("residual inputs"))?;
-                Some(network.forward(&columns).map_err(error::stage("residual network"))?)
-            }
-            None => None,
-        };
-        let transfer = match transfer_config(model).filter(|_| self.needs.subsurface.needed) {
-            Some(config) => Some(
-                transfer_radiance(&rows.transfer, &lit.directions, config).map_err(error::stage("transfer vectors"))?.0,
-            ),
-            None => None,
-        };
-        Ok(Lit { network: network.map(|o| (o.residual, o.incident)), transfer, visibility: lit.visibility })
+    /// Visibility of one light from the rows of a view; empty where nothing reads it.
+    fn visibility(
+        &self,
+        view: &ViewHalf,
+        light: &OlatLight,
+        layout: &ChannelLayout,
+    ) -> Result<Vec<f32>, ReconstructError> {
+        if !self.needs.visibility.needed && layout.place(channel::VISIBILITY).is_none() {
+            return Ok(Vec::new());
+        }
+        if !self.model.config.visibility.traced {
+            return Ok(LightRows::new(self.model, &view.rows, light, VisibilitySource::Fitted)?.visibility);
+        }
+        let Activated { gaussians, normals, .. } = &self.activated;
+        self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible)
     }
 }
 
@@ -301,7 +286,8 @@ struct ViewHalf {
     projection: Projection,
     /// Of the Gaussians that pass something to a pixel.
     rows: Rows,
-    network: Option<ManyLights>,
+    /// The same, ready for lights.
+    lit: LitRows,
     /// Outside of it no Gaussian covers anything.
     region: Region,
     prepared: Prepared,
@@ -309,20 +295,38 @@ struct ViewHalf {
     opacity: Image,
 }
 
-/// What one light adds, row by row.
-struct Lit {
-    network: Option<(Vec<f32>, Vec<f32>)>,
-    transfer: Option<Vec<f32>>,
-    visibility: Vec<f32>,
-}
-
-impl Lit {
-    fn transported(&self) -> Transported<'_> {
-        Transported {
-            network: self.network.as_ref().map(|(residual, incident)| (residual.as_slice(), incident.as_slice())),
-            transfer: self.transfer.as_deref(),
-            visibility: &self.visibility,
+impl ViewHalf {
+    /// Places of a light's channels, of which the first is `first`.
+    fn channels(&self, first: usize) -> TransportChannels {
+        let at = |c: usize| self.per_light.place(c).map(|place| first + place);
+        TransportChannels {
+            residual: at(channel::RESIDUAL.start),
+            incident: at(channel::INCIDENT),
+            visibility: at(channel::VISIBILITY),
         }
+    }
+
+    /// Writes the channels of all `lights` into the feature rows of the view's rows.
+    fn write(&self, lights: &[(OlatLight, &[f32])], features: &mut Features) -> Result<(), ReconstructError> {
+        let (rows, width) = (&self.rows.visible, features.channels);
+        let channels = LightChannels { places: self.channels(0), per_light: self.per_light.count() };
+        // Rows ascend: each task has a piece of its own.
+        let (mut pieces, mut rest, mut start) = (Vec::new(), features.data.as_mut_slice(), 0);
+        for rows in rows.chunks(LitRows::TASK_ROWS) {
+            let end = rows[rows.len() - 1] as usize + 1;
+            let (piece, after) = rest.split_at_mut((end - start) * width);
+            pieces.push((start, piece));
+            (rest, start) = (after, end);
+        }
+        // Asked here: the setting belongs to the thread that called.
+        let level = Level::current();
+        pieces.into_par_iter().enumerate().try_for_each(|(task, (start, piece))| {
+            let put = |row: usize, values: &[f32]| {
+                let at = (rows[row] as usize - start) * width;
+                piece[at..at + width].copy_from_slice(values);
+            };
+            self.lit.task(task, level, lights, &channels, put).map_err(error::stage("residual network"))
+        })
     }
 }
 

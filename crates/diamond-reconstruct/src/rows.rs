@@ -80,8 +80,6 @@ pub(crate) struct LightRows {
 pub(crate) enum VisibilitySource<'a> {
     /// One traced value per Gaussian.
     Traced(&'a [f32]),
-    /// One traced value per row.
-    TracedRows(&'a [f32]),
     /// The SH fit.
     Fitted,
     /// Nothing reads it.
@@ -106,7 +104,6 @@ impl LightRows {
         let directions: Vec<Vec3> = incidence.iter().map(|i| i.direction).collect();
         let visibility = match source {
             VisibilitySource::Traced(v) => rows.visible.iter().map(|&i| v[i as usize]).collect(),
-            VisibilitySource::TracedRows(v) => v.to_vec(),
             VisibilitySource::Unread => vec![0.0; rows.len()],
             VisibilitySource::Fitted => {
                 let sh = gather(

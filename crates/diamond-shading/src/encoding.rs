@@ -199,7 +199,19 @@ impl InputScaling {
         }
     }
 
-    fn distance_input(&self, distance: f32) -> f32 {
+    /// [`InputScaling::distance_input`] of finite distances, none below 0.
+    #[inline(always)]
+    pub(crate) fn distance_input_of<S: Simd>(&self, distance: Lanes<S>) -> Lanes<S> {
+        match self.light_distance {
+            LightDistanceInput::Linear => distance,
+            LightDistanceInput::Bounded { reference } => {
+                let reference = distance.same(reference.max(MIN_LENGTH));
+                distance.same(1.0) - (reference / (distance + reference)) * 2.0
+            }
+        }
+    }
+
+    pub(crate) fn distance_input(&self, distance: f32) -> f32 {
         match self.light_distance {
             LightDistanceInput::Linear if distance.is_finite() => distance,
             LightDistanceInput::Linear => 0.0,

@@ -19,7 +19,7 @@ pub(crate) struct Arriving<T> {
     /// Linear RGB on a plane that faces the light.
     pub irradiance: Vector<T>,
     /// At least [`MIN_LIGHT_DISTANCE`]; 1 for directional lights.
-    distance: T,
+    pub distance: T,
     /// reference/distance of the inverse square.
     ratio: T,
 }

@@ -117,25 +117,11 @@ impl<'a> ChunkNetwork<'a> {
     /// All layers: fills the block after its inputs.
     /// `[eq:mlp]`
     pub(crate) fn forward(&self, rows: usize, block: &mut [f32]) {
-        self.forward_onto(rows, block, None);
-    }
-
-    /// As [`ChunkNetwork::forward`], but the first layer's product is added to `sums` `[rows × padded outputs]` in place of
-    /// its bias.
-    /// `[eq:mlp]`
-    pub(crate) fn forward_onto(&self, rows: usize, block: &mut [f32], sums: Option<&[f32]>) {
         let widths = &self.shape.widths;
         let (mut x, mut rest) = block.split_at_mut(rows * padded(widths[0]));
         for (l, layer) in self.layers.iter().enumerate() {
             let stride = padded(widths[l + 1]);
             let (y, after) = rest.split_at_mut(rows * stride);
-            let init = match sums {
-                Some(sums) if l == 0 => {
-                    y.copy_from_slice(&sums[..rows * stride]);
-                    Init::Accumulate
-                }
-                _ => Init::Row(&layer.bias),
-            };
             dispatch(Product {
                 a: x,
                 a_stride: padded(widths[l]),
@@ -147,7 +133,7 @@ impl<'a> ChunkNetwork<'a> {
                 rows,
                 inner: widths[l],
                 columns: widths[l + 1],
-                init,
+                init: Init::Row(&layer.bias),
             });
             dispatch(Activate { values: y, activation: self.shape.activation(l) });
             (x, rest) = (y, after);

@@ -112,7 +112,7 @@ pub struct TransportChannels {
 
 impl TransportChannels {
     /// One past the last channel.
-    fn end(&self) -> usize {
+    pub(crate) fn end(&self) -> usize {
         let last = self.residual.map(|c| c + 2).max(self.incident).max(self.visibility);
         last.map_or(0, |c| c + 1)
     }

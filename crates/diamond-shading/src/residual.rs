@@ -4,12 +4,11 @@
 //! into a residual colour, and an optional second head into the incident light, which stands for the unknown intensity
 //! and falloff of the light. Both heads' gradients reach the trunk. A chunk of rows goes through the trunk and the heads
 //! without leaving the cache, forward and backward.
-use crate::encoding::{LIGHT_COLUMNS, RESIDUAL_INPUTS};
+use crate::encoding::RESIDUAL_INPUTS;
 use crate::error::{ShadingError, check_length};
 use crate::mlp::{Activation, CHUNK_ROWS, Groups, Mlp, MlpShape};
 use crate::mlp_chunk::{ChunkNetwork, sum_in_order};
 use crate::row_chunks::{map_chunks, map_chunks_mut, with_scratch};
-use crate::simd::padded;
 
 /// Widths and activations of a [`ResidualNetwork`].
 #[derive(Debug, Clone, PartialEq)]
@@ -172,23 +171,21 @@ impl ResidualNetwork {
         self.check()?;
         let width = self.inputs();
         check_length("inputs of ResidualNetwork::forward (batch × inputs)", batch.saturating_mul(width), inputs.len())?;
-        let output = evaluate(self, inputs, batch, None);
+        let output = evaluate(self, inputs, batch);
         Ok((output, ResidualPullback { network: self, inputs, batch }))
     }
 }
 
-/// The values of a checked network; `sums` `[batch × padded outputs]` replaces the bias of the first layer.
-fn evaluate(network: &ResidualNetwork, inputs: &[f32], batch: usize, sums: Option<&[f32]>) -> ResidualOutput {
+/// The values of a checked network.
+fn evaluate(network: &ResidualNetwork, inputs: &[f32], batch: usize) -> ResidualOutput {
     let width = network.inputs();
-    let stride = sums.map_or(0, |sums| sums.len() / batch.max(1));
     let networks = Networks::new(network);
     let mut residual = vec![0.0; 3 * batch];
     let incident = map_chunks_mut(&mut residual, 3 * CHUNK_ROWS, |chunk, residual| {
         let rows = residual.len() / 3;
         with_scratch(networks.block_length(rows), |blocks| {
             let inputs = &inputs[chunk * CHUNK_ROWS * width..][..rows * width];
-            let sums = sums.map(|sums| &sums[chunk * CHUNK_ROWS * stride..][..rows * stride]);
-            networks.forward_onto(inputs, rows, blocks, sums);
+            networks.forward(inputs, rows, blocks);
             let (_, blocks) = blocks.split_at_mut(networks.trunk.block_length(rows));
             let (residual_block, incident_block) = blocks.split_at_mut(networks.residual_head.block_length(rows));
             networks.residual_head.store_outputs(rows, residual_block, residual);
@@ -201,69 +198,6 @@ fn evaluate(network: &ResidualNetwork, inputs: &[f32], batch: usize, sums: Optio
         })
     });
     ResidualOutput { residual, incident: incident.concat() }
-}
-
-/// A residual network for many lights of the same rows: the first layer's sums over the inputs that do not depend on the
-/// light are done once.
-#[derive(Debug, Clone)]
-pub struct ManyLights {
-    /// The network with the light's inputs alone.
-    network: ResidualNetwork,
-    /// First layer's bias and sums over the other inputs `[batch × padded outputs]`.
-    sums: Vec<f32>,
-    batch: usize,
-}
-
-impl ResidualNetwork {
-    /// Prepares for many lights of the rows `inputs` `[batch × inputs]`, in which the columns of the light
-    /// ([`LIGHT_COLUMNS`]) are not looked at.
-    ///
-    /// Errors: as [`ResidualNetwork::forward`].
-    /// `[eq:residual-network]`
-    pub fn many_lights(&self, inputs: &[f32], batch: usize) -> Result<ManyLights, ShadingError> {
-        self.check()?;
-        let width = self.inputs();
-        let expected = batch.saturating_mul(width);
-        check_length("inputs of ResidualNetwork::many_lights (batch × inputs)", expected, inputs.len())?;
-        let widths = &self.trunk.shape.widths;
-        let outputs = widths[1];
-        let (first, rest) = self.trunk.parameters.split_at(outputs * (width + 1));
-        let (weights, bias) = first.split_at(outputs * width);
-        let mut fixed = first.to_vec();
-        let mut light = Vec::with_capacity(outputs * (LIGHT_COLUMNS.len() + 1) + rest.len());
-        for (line, fixed) in weights.chunks_exact(width).zip(fixed.chunks_exact_mut(width)) {
-            light.extend(LIGHT_COLUMNS.iter().map(|&c| line[c]));
-            LIGHT_COLUMNS.iter().for_each(|&c| fixed[c] = 0.0);
-        }
-        // The bias is in the sums already.
-        light.resize(light.len() + bias.len(), 0.0);
-        light.extend_from_slice(rest);
-        let shape = MlpShape { widths: vec![width, outputs], hidden: Activation::Linear, output: Activation::Linear };
-        let fixed = Mlp { shape, parameters: fixed };
-        let (values, _) = fixed.forward(inputs, batch)?;
-        let stride = padded(outputs);
-        let mut sums = vec![0.0; batch * stride];
-        for (to, from) in sums.chunks_exact_mut(stride).zip(values.chunks_exact(outputs)) {
-            to[..outputs].copy_from_slice(from);
-        }
-        let mut shape = self.trunk.shape.clone();
-        shape.widths[0] = LIGHT_COLUMNS.len();
-        let trunk = Mlp { shape, parameters: light };
-        Ok(ManyLights { network: ResidualNetwork { trunk, ..self.clone() }, sums, batch })
-    }
-}
-
-impl ManyLights {
-    /// What [`ResidualNetwork::forward`] gives for the rows under one light, to rounding; `light` `[batch × 5]` holds the
-    /// columns [`LIGHT_COLUMNS`] (see [`ResidualInputs::light_columns`](crate::ResidualInputs::light_columns)). A row's
-    /// bits do not depend on the others.
-    ///
-    /// Errors: [`ShadingError::Shape`] if `light` has the wrong length.
-    /// `[eq:residual-network]`
-    pub fn forward(&self, light: &[f32]) -> Result<ResidualOutput, ShadingError> {
-        check_length("light of ManyLights::forward (batch × 5)", self.batch * LIGHT_COLUMNS.len(), light.len())?;
-        Ok(evaluate(&self.network, light, self.batch, Some(&self.sums)))
-    }
 }
 
 impl ResidualNetwork {
@@ -305,13 +239,9 @@ impl<'a> Networks<'a> {
     }
 
     fn forward(&self, inputs: &[f32], rows: usize, blocks: &mut [f32]) {
-        self.forward_onto(inputs, rows, blocks, None);
-    }
-
-    fn forward_onto(&self, inputs: &[f32], rows: usize, blocks: &mut [f32], sums: Option<&[f32]>) {
         let (block, mut blocks) = blocks.split_at_mut(self.trunk.block_length(rows));
         self.trunk.load(inputs, rows, block);
-        self.trunk.forward_onto(rows, block, sums);
+        self.trunk.forward(rows, block);
         let features = self.trunk.padded_outputs(rows, block);
         for head in self.each().skip(1) {
             let (block, rest) = blocks.split_at_mut(head.block_length(rows));
@@ -444,37 +374,5 @@ mod tests {
         network.residual_head.shape.widths = vec![31, 3];
         network.residual_head.parameters.truncate(31 * 3 + 3);
         assert!(matches!(network.forward(&[0.0; 42], 1), Err(ShadingError::Shape { .. })));
-    }
-
-    /// [eq:residual-network] Lights prepared for give what the whole network gives, and a part of the rows gives the same
-    /// bits as all of them.
-    #[test]
-    fn many_lights_agree_with_one_at_a_time() {
-        let config = ResidualNetworkConfig { code_size: 3, ..ResidualNetworkConfig::sss_3dgs() };
-        let mut state = 7u32;
-        let mut uniform = || {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (state >> 8) as f32 / 16_777_216.0
-        };
-        let network = ResidualNetwork::initialise(&config, &mut uniform).unwrap();
-        let (rows, width) = (230, config.inputs());
-        let mut inputs: Vec<f32> = (0..rows * width).map(|_| 2.0 * uniform() - 1.0).collect();
-        let prepared = network.many_lights(&inputs, rows).unwrap();
-        let half = network.many_lights(&inputs[100 * width..], rows - 100).unwrap();
-        for _ in 0..3 {
-            let light: Vec<f32> = (0..rows * 5).map(|_| 2.0 * uniform() - 1.0).collect();
-            for (row, light) in inputs.chunks_exact_mut(width).zip(light.chunks_exact(5)) {
-                LIGHT_COLUMNS.iter().zip(light).for_each(|(&c, v)| row[c] = *v);
-            }
-            let (expected, _) = network.forward(&inputs, rows).unwrap();
-            let found = prepared.forward(&light).unwrap();
-            let pairs =
-                expected.residual.iter().zip(&found.residual).chain(expected.incident.iter().zip(&found.incident));
-            for (a, b) in pairs {
-                assert!((a - b).abs() <= 2e-6 * (1.0 + a.abs()), "{a} {b}");
-            }
-            assert_eq!(half.forward(&light[500..]).unwrap().residual, found.residual[300..]);
-        }
-        assert!(prepared.forward(&[0.0; 4]).is_err() && network.many_lights(&inputs[1..], rows).is_err());
     }
 }

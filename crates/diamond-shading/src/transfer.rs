@@ -11,9 +11,12 @@
 //! loses additivity over lights where the sum is below a few `1/sharpness`: softplus(a) + softplus(b) ≠ softplus(a + b).
 //! It stays linear in the intensity as long as the intensity multiplies the result, not the coefficients.
 use crate::error::{ShadingError, check_length};
+use crate::number::Number;
 use crate::row_chunks::map_chunks_mut;
 use crate::simd::MAGNITUDE_LIMIT;
+use crate::vector::Vector;
 use diamond_light::spherical_harmonics::{COEFFICIENTS, MAX_DEGREE, basis, basis_pull};
+use diamond_simd::{BLOCK, Lanes, Simd};
 use glam::Vec3;
 
 /// Rows per parallel task.
@@ -76,12 +79,64 @@ impl TransferConfig {
         }
     }
 
+    /// [`TransferConfig::activate`] in every lane.
+    #[inline(always)]
+    pub(crate) fn activate_lanes<S: Simd>(&self, x: Lanes<S>) -> Lanes<S> {
+        if self.activation == TransferActivation::Linear {
+            return x;
+        }
+        let mut lanes = [0.0; BLOCK];
+        x.store(&mut lanes);
+        for v in &mut lanes[..S::F32_LANES] {
+            *v = self.activate(*v);
+        }
+        Lanes::load(x.s, &lanes)
+    }
+
     fn slope(&self, x: f32) -> f32 {
         match self.activation {
             TransferActivation::Linear => 1.0,
             TransferActivation::Softplus { sharpness } => 1.0 / (1.0 + libm::expf(-sharpness * x)),
         }
     }
+}
+
+/// [`basis`] over a [`Number`]; a test holds both to the same values.
+/// `[eq:sh-basis]`
+#[inline(always)]
+pub(crate) fn basis_at<T: Number>(d: Vector<T>) -> [T; COEFFICIENTS] {
+    // √(1/4π), √(3/4π), √(15/4π), √(5/16π), √(15/16π), √(35/32π), √(105/4π), √(21/32π), √(7/16π)
+    const K: [f32; 9] = [
+        0.282_094_79,
+        0.488_602_51,
+        1.092_548_4,
+        0.315_391_57,
+        0.546_274_2,
+        0.590_043_6,
+        2.890_611_4,
+        0.457_045_8,
+        0.373_176_34,
+    ];
+    let Vector { x, y, z } = d;
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        x.same(K[0]),
+        y * -K[1],
+        z * K[1],
+        x * -K[1],
+        x * y * K[2],
+        y * z * -K[2],
+        (zz * 3.0 - 1.0) * K[3],
+        x * z * -K[2],
+        (xx - yy) * K[4],
+        y * (xx * 3.0 - yy) * -K[5],
+        x * y * z * K[6],
+        y * (zz * 5.0 - 1.0) * -K[7],
+        z * (zz * 5.0 - 3.0) * K[8],
+        x * (zz * 5.0 - 1.0) * -K[7],
+        z * (xx - yy) * (0.5 * K[6]),
+        x * (xx - yy * 3.0) * -K[5],
+    ]
 }
 
 /// The gradient of a transfer.
@@ -188,5 +243,22 @@ impl TransferPullback<'_> {
             directions
         });
         Ok(TransferGrad { transfer, light_directions: direction_gradient.then(|| directions.concat()) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// [eq:sh-basis] What the harmonics of `diamond-light` are, on and off the unit sphere.
+    #[test]
+    fn vectors_have_the_same_basis() {
+        for i in 0..200 {
+            let t = i as f32;
+            let d = Vec3::new((1.3 * t).sin(), (2.1 * t + 0.4).sin(), (0.7 * t + 1.0).sin());
+            for (a, b) in basis(d).iter().zip(basis_at(Vector::from(d))) {
+                assert!((a - b).abs() <= 1e-6, "{d}: {a} {b}");
+            }
+        }
     }
 }
