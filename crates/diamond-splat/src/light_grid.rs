@@ -26,12 +26,12 @@ const MARGIN: f32 = 1e-4;
 /// Rays of a cell, about: lists are longer in larger cells; in smaller ones the rays of a vector begin at very different
 /// depths.
 const RAYS_PER_CELL: f32 = 32.0;
-/// Cells along a side at most.
+/// Cells along a side at most; a number of a cell is a `u16`.
 const MAX_CELLS: usize = 128;
 /// Half a side of the grid in standard deviations of the Gaussians' places; what lies beyond belongs to the cells at the
 /// edge.
 const GRID_REACH: f32 = 2.5;
-/// Depths that are told apart in the lists.
+/// Depths that are told apart in the lists, `u16`s.
 const DEPTHS: usize = 1024;
 /// Cells that are one task.
 const CELLS_PER_TASK: usize = 64;
@@ -311,16 +311,16 @@ struct Cells {
 }
 
 impl Cells {
-    /// `each` calls its argument with every (item, cell), twice in the same order.
-    fn new(count: usize, each: impl Fn(&mut dyn FnMut(u32, usize))) -> Self {
+    /// Of every (item, cell).
+    fn new(count: usize, each: impl Iterator<Item = (u32, usize)> + Clone) -> Self {
         let mut next = vec![0u32; count + 1];
-        each(&mut |_, cell| next[cell + 1] += 1);
+        each.clone().for_each(|(_, cell)| next[cell + 1] += 1);
         for cell in 0..count {
             next[cell + 1] += next[cell];
         }
         let starts = next.clone();
         let mut items = vec![0; starts[count] as usize];
-        each(&mut |item, cell| {
+        each.for_each(|(item, cell)| {
             items[next[cell] as usize] = item;
             next[cell] += 1;
         });
@@ -351,20 +351,31 @@ impl Grid {
         let n = seen.len().max(1) as f32;
         let (mut low, mut scale) = ([0.0; 2], [0.0; 2]);
         let side = side.clamp(1, MAX_CELLS);
+        let (mut sum, mut first, mut last) = ([0.0f32; 2], [f32::INFINITY; 2], [f32::NEG_INFINITY; 2]);
+        let (mut nearest, mut farthest) = (f32::INFINITY, f32::NEG_INFINITY);
+        for s in seen {
+            for k in 0..2 {
+                sum[k] += s.at[k];
+                (first[k], last[k]) = (first[k].min(s.low[k]), last[k].max(s.high[k]));
+            }
+            (nearest, farthest) = (nearest.min(s.begin), farthest.max(s.begin));
+        }
+        let mean = sum.map(|sum| sum / n);
+        let mut squares = [0.0f32; 2];
+        for s in seen {
+            for k in 0..2 {
+                squares[k] += (s.at[k] - mean[k]) * (s.at[k] - mean[k]);
+            }
+        }
         for k in 0..2 {
-            let mean = seen.iter().map(|s| s.at[k]).sum::<f32>() / n;
-            let variance = seen.iter().map(|s| (s.at[k] - mean) * (s.at[k] - mean)).sum::<f32>() / n;
-            let reach = GRID_REACH * variance.sqrt();
-            let begin = seen.iter().map(|s| s.low[k]).fold(f32::INFINITY, f32::min).max(mean - reach);
-            let end = seen.iter().map(|s| s.high[k]).fold(f32::NEG_INFINITY, f32::max).min(mean + reach);
+            let reach = GRID_REACH * (squares[k] / n).sqrt();
+            let (begin, end) = (first[k].max(mean[k] - reach), last[k].min(mean[k] + reach));
             let cells = side as f32 / (end - begin);
             // Else everything is in one line of cells.
             if end > begin && cells.is_finite() {
                 (low[k], scale[k]) = (begin, cells);
             }
         }
-        let nearest = seen.iter().map(|s| s.begin).fold(f32::INFINITY, f32::min);
-        let farthest = seen.iter().map(|s| s.begin).fold(f32::NEG_INFINITY, f32::max);
         let depths = (DEPTHS - 1) as f32 / (farthest - nearest);
         let depths = if depths.is_finite() { depths } else { 0.0 };
         Self { low, scale, side, nearest, depths }
@@ -507,26 +518,29 @@ impl LightGrid {
     fn trace(&self, level: Level, seen: &mut [Seen], rays: &[Ray], receivers: &[u32]) -> Vec<f32> {
         let grid = Grid::new(seen, self.len());
         let count = grid.side * grid.side;
-        let by_depth = Cells::new(DEPTHS, |put| {
-            seen.iter().enumerate().for_each(|(i, s)| put(i as u32, grid.depth(s.begin)));
-        });
-        let lists = Cells::new(count, |put| {
-            for &i in &by_depth.items {
+        let depths: Vec<u16> = seen.iter().map(|s| grid.depth(s.begin) as u16).collect();
+        let by_depth = Cells::new(DEPTHS, (0..).zip(depths.iter().map(|&depth| usize::from(depth))));
+        // Left, right, top, bottom.
+        let reached: Vec<[u8; 4]> = (by_depth.items.iter())
+            .map(|&i| {
                 let s = &seen[i as usize];
                 let ((left, right), (top, bottom)) = (grid.lines(0, s), grid.lines(1, s));
-                for y in top..=bottom {
-                    (left..=right).for_each(|x| put(i, y * grid.side + x));
-                }
-            }
-        });
+                [left as u8, right as u8, top as u8, bottom as u8]
+            })
+            .collect();
+        let side = grid.side;
+        let cells_of = |(&i, reached): (&u32, &[u8; 4])| {
+            let [left, right, top, bottom] = reached.map(usize::from);
+            (top..bottom + 1).flat_map(move |y| (y * side + left..y * side + right + 1).map(move |cell| (i, cell)))
+        };
+        let lists = Cells::new(count, by_depth.items.iter().zip(&reached).flat_map(cells_of));
         seen.iter_mut().for_each(|s| s.begin = grid.begin_of_rest(s.begin));
         let seen = &*seen;
-        let by_depth = Cells::new(DEPTHS, |put| {
-            rays.iter().enumerate().for_each(|(k, ray)| put(k as u32, grid.depth(ray.end)));
-        });
-        let members = Cells::new(count, |put| {
-            by_depth.items.iter().for_each(|&k| put(k, grid.cell(rays[k as usize].at)));
-        });
+        let places: Vec<[u16; 2]> =
+            rays.iter().map(|ray| [grid.depth(ray.end) as u16, grid.cell(ray.at) as u16]).collect();
+        let by_depth = Cells::new(DEPTHS, (0..).zip(places.iter().map(|place| usize::from(place[0]))));
+        let cell_of = |&k: &u32| (k, usize::from(places[k as usize][1]));
+        let members = Cells::new(count, by_depth.items.iter().map(cell_of));
         let traced: Vec<Vec<(u32, f32)>> = (0..count.div_ceil(CELLS_PER_TASK))
             .into_par_iter()
             .map(|task| {
