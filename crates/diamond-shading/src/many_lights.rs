@@ -470,7 +470,7 @@ mod tests {
             let width = 3 * transfer_config.coefficients();
             let transfer: Vec<f32> = (0..n * width).map(|_| uniform() - 0.5).collect();
             let (zeros, scales) = (vec![0.0; n], vec![Vec3::ONE; n]);
-            let mut inputs = ResidualInputs {
+            let inputs = ResidualInputs {
                 positions: &positions,
                 rotations: &vec![Quat::IDENTITY; n],
                 scales: &scales,
@@ -494,9 +494,12 @@ mod tests {
                 let incidence: Vec<_> = positions.iter().map(|p| light.incidence(*p, Falloff::None)).collect();
                 let directions: Vec<Vec3> = incidence.iter().map(|i| i.direction).collect();
                 let distances: Vec<f32> = incidence.iter().map(|i| i.distance).collect();
-                inputs.light_directions = &directions;
-                inputs.light_distances = &distances;
-                inputs.visibility = &visibility[k];
+                let inputs = ResidualInputs {
+                    light_directions: &directions,
+                    light_distances: &distances,
+                    visibility: &visibility[k],
+                    ..inputs
+                };
                 let (matrix, _) = inputs.assemble(&scaling).unwrap();
                 let (expected, _) = network.forward(&matrix, n).unwrap();
                 let (transported, _) = transfer_radiance(&transfer, &directions, transfer_config).unwrap();
