@@ -6,7 +6,8 @@
 use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_dataset::{Capture, OpenOptions};
 use diamond_light::OlatLight;
-use diamond_reconstruct::{Config, Model, Reconstruction, Renderer};
+use diamond_image::Image;
+use diamond_reconstruct::{Config, Model, ReconstructError, Reconstruction, Renderer};
 use glam::Vec3;
 use std::path::Path;
 use std::time::Instant;
@@ -87,10 +88,22 @@ fn main() -> Result<(), Failure> {
     let lights: Vec<OlatLight> = directions(112)
         .map(|d| OlatLight::Point { position: model.scene.centre() + distance * d, intensity: Vec3::ONE })
         .collect();
-    println!("{:?}", Renderer::new(&model).work(&camera, 112)?);
+    println!("{:?}", Renderer::new(&model).work(&camera)?);
     println!("                       processors    × one   each         wall    × one   each");
     // A renderer for each repetition: what it does once per model counts too.
-    let of = |model: &Model, n: usize| time(|| Ok(Renderer::new(model).radiance(&camera, &lights[..n]).map(drop)?));
+    let of = |model: &Model, n: usize| {
+        time(|| {
+            let mut sum = 0.0;
+            let see = |_: usize, image: &Image| -> Result<(), ReconstructError> {
+                sum += image.data()[image.data().len() / 2];
+                Ok(())
+            };
+            Renderer::new(model).each_radiance(&camera, &lights[..n], see)?;
+            std::hint::black_box(sum);
+            Ok(())
+        })
+    };
+    let kept = |model: &Model, n: usize| time(|| Ok(Renderer::new(model).radiance(&camera, &lights[..n]).map(drop)?));
     let show = |what: &str, n: usize, one: Time, all: Time| {
         let column = |one: f64, all: f64| format!("{all:8.2} ms {:7.2} {:7.3}", all / one, all / n as f64);
         println!("{n:4} lights{what:8} {}  {}", column(one.processors, all.processors), column(one.wall, all.wall));
@@ -99,6 +112,7 @@ fn main() -> Result<(), Failure> {
     for n in [1, 4, 16, 112] {
         show("", n, one, of(&model, n)?);
     }
+    show(" kept", 112, kept(&model, 1)?, kept(&model, 112)?);
     let mut untraced = model.clone();
     untraced.config.visibility.traced = false;
     let one = of(&untraced, 1)?;

@@ -1,37 +1,35 @@
 //! Pictures of a model: what does not depend on the light is done once for all lights of a view, and what does not
 //! depend on the view once for all views.
 //!
-//! For a view: projection, blending of the light-independent channels, the rectangle that is covered, the shader's half,
-//! the sums of the network's first layer, and which Gaussians pass anything to a pixel at all (those behind others do
-//! not). For a light remain: rays from those Gaussians, the rest of the network, three to five channels in a
-//! rasterisation that sixteen lights share, and the shader's other half on covered pixels.
+//! For a view: projection, who is seen in which pixel and how much ([`BlendWeights`]), the light-independent channels, the
+//! shader's half, and the sums of the network's first layer. For a light remain, of the Gaussians that are seen: rays and
+//! the rest of the network; and of the blocks of pixels that show anything: three to five channels and the
+//! shader's other half. Blending and shading of a block happen in the first cache, for twelve lights one after the other.
 //!
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
-use crate::exposure::expose;
 use crate::forward::{Settings, raster_config};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
-use crate::rows::{
-    LightRows, Rows, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
-};
+use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
 use crate::visibility_cache::Tracer;
 use crate::{Activated, CaptureFacts, Model, Needs, ReconstructError, Rendering, error};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
-use diamond_shading::{GBuffer, LightChannels, LitRows, Prepared, Shaded, ShadedMaps, TransportChannels, channel};
-use diamond_simd::Level;
-use diamond_splat::{Features, Projection, Raster, RasterGrad, project, rasterize_projected};
+use diamond_shading::{
+    BlendedBlock, BlockShader, LightChannels, LitRows, PreparedBlock, Shaded, ShadedMaps, ShadedRecords, ShadingError,
+    TransportChannels, channel,
+};
+use diamond_simd::{BLOCK, Level};
+use diamond_splat::{BlendBlock, BlendWeights, BlockBlender, KeepAll, project};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
-/// Lights whose residuals are blended in one rasterisation, unless told otherwise: bounds the memory of their channels.
-pub const LIGHTS_PER_RASTERISATION: usize = 16;
-/// From so many lights on it pays to find out which Gaussians pass something to a pixel: it costs about as much as one
-/// light, and spares each light the others.
-const LIGHTS_TO_LOOK_AHEAD: usize = 4;
+/// Lights that go through the rows and pixels of a view together, unless told otherwise: bounds the memory of their
+/// channels.
+pub const LIGHTS_TOGETHER: usize = 12;
 
 /// A model ready to be rendered from any number of views.
 pub struct Renderer<'m> {
@@ -43,9 +41,6 @@ pub struct Renderer<'m> {
     lights_together: usize,
 }
 
-/// Shades a group of lights of a view from their channels.
-type ShadeGroup<'a> = dyn FnMut(&ViewHalf, &[OlatLight], &Image) -> Result<(), ReconstructError> + 'a;
-
 /// How much work a view was.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RenderWork {
@@ -53,13 +48,13 @@ pub struct RenderWork {
     pub visible: usize,
     /// Gaussians whose residual and visibility were computed, per light.
     pub rows: usize,
-    /// Channels rasterised once.
+    /// Channels blended once.
     pub fixed_channels: usize,
-    /// Channels rasterised per light.
+    /// Channels blended per light.
     pub light_channels: usize,
     /// Pixels of the picture.
     pub pixels: usize,
-    /// Pixels of the rectangle that was shaded.
+    /// Pixels of the blocks that were shaded.
     pub shaded: usize,
 }
 
@@ -68,17 +63,17 @@ impl<'m> Renderer<'m> {
     pub fn new(model: &'m Model) -> Self {
         let activated = model.parameters.activate();
         let needs = Needs::decide(&model.config, &CaptureFacts::default()).rendering(&activated);
-        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_PER_RASTERISATION }
+        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_TOGETHER }
     }
 
     /// Of a model with given decisions on what is computed.
     pub fn with_needs(model: &'m Model, needs: RenderNeeds) -> Self {
         let activated = model.parameters.activate();
-        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_PER_RASTERISATION }
+        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_TOGETHER }
     }
 
-    /// With so many lights blended in one rasterisation (at least 1; [`LIGHTS_PER_RASTERISATION`] unless told otherwise):
-    /// memory and time depend on it, pictures do not.
+    /// With so many lights going through a view together (at least 1; [`LIGHTS_TOGETHER`] unless told otherwise): memory
+    /// and time depend on it, pictures do not.
     pub fn with_lights_together(self, lights: usize) -> Self {
         Self { lights_together: lights.max(1), ..self }
     }
@@ -90,61 +85,106 @@ impl<'m> Renderer<'m> {
 
     /// The radiance of one view under each light: linear RGB over black.
     pub fn radiance(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Image>, ReconstructError> {
-        let (mut out, layout) = (Vec::with_capacity(lights.len()), self.needs.layout());
-        self.each_group(camera, lights, &layout, &mut |view, lights, transport| {
-            let (width, height) = view.size;
-            let per_light = view.per_light.count();
-            let images = lights.par_iter().enumerate().map(|(k, light)| {
-                let channels = view.channels(k * per_light);
-                let light = self.model.scene.scaled_light(light);
-                let part = view.prepared.radiance(&light, transport, &channels).map_err(error::stage("shade"))?;
-                Ok(view.region.paste(&self.exposed(part), width, height))
-            });
-            out.extend(images.collect::<Result<Vec<_>, ReconstructError>>()?);
-            Ok(())
-        })?;
+        if lights.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut out = Vec::with_capacity(lights.len());
+        let view = self.view(camera, &self.needs.layout())?;
+        let mut buffers = Buffers::default();
+        for group in lights.chunks(self.lights_together) {
+            self.radiance_group(&view, group, &mut buffers)?;
+            out.append(&mut buffers.images);
+        }
         Ok(out)
+    }
+
+    /// As [`Renderer::radiance`], but calls `see` with the number of each light and its picture, in order, and uses the
+    /// memory of a picture again: for pictures that are written or compared one by one.
+    ///
+    /// # Errors
+    /// The renderer's, and whatever `see` returns, which ends it.
+    pub fn each_radiance<E: From<ReconstructError>>(
+        &self,
+        camera: &Camera,
+        lights: &[OlatLight],
+        mut see: impl FnMut(usize, &Image) -> Result<(), E>,
+    ) -> Result<(), E> {
+        if lights.is_empty() {
+            return Ok(());
+        }
+        let view = self.view(camera, &self.needs.layout())?;
+        let mut buffers = Buffers::default();
+        for (g, group) in lights.chunks(self.lights_together).enumerate() {
+            self.radiance_group(&view, group, &mut buffers)?;
+            for (k, image) in buffers.images.iter().enumerate() {
+                see(g * self.lights_together + k, image)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Radiance of one view under a group of lights; `buffers` may hold another group's.
+    fn radiance_group(
+        &self,
+        view: &ViewHalf,
+        group: &[OlatLight],
+        buffers: &mut Buffers,
+    ) -> Result<(), ReconstructError> {
+        let whole = Region::whole(view.size.0, view.size.1);
+        let gain = self.model.exposure.of_renderings(self.model.config.exposure.mode);
+        let shade = |block: &PreparedBlock, lights: &[OlatLight], sums: &[[f32; BLOCK]], out: &mut [_]| {
+            view.shader.radiance(block, lights, &view.channels, sums, out)?;
+            if gain != Vec3::ONE {
+                out.iter_mut().for_each(|out| expose(out, gain));
+            }
+            Ok(())
+        };
+        self.group::<3>(view, group, &whole, shade, buffers)
     }
 
     /// As [`Renderer::radiance`], with both parts of the light and all maps.
     pub fn renderings(&self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
         // The maps show every channel, whether or not the radiance depends on it.
-        let (mut out, layout) = (Vec::with_capacity(lights.len()), ChannelLayout::full());
-        self.each_group(camera, lights, &layout, &mut |view, lights, transport| {
-            let (width, height) = view.size;
-            let per_light = view.per_light.count();
-            for (k, light) in lights.iter().enumerate() {
-                let transport = transport.channels_range(k * per_light..(k + 1) * per_light);
-                let light = self.model.scene.scaled_light(light);
-                let mut shaded = view.prepared.shade(&light, Some(&transport)).map_err(error::stage("shade"))?;
-                shaded.radiance = self.exposed(shaded.radiance);
-                shaded.surface = self.exposed(shaded.surface);
-                shaded.subsurface = self.exposed(shaded.subsurface);
-                out.push(rendering(shaded, &view.region, &view.opacity, width, height));
+        let view = self.view(camera, &ChannelLayout::full())?;
+        let (width, height) = view.size;
+        let region = view.region();
+        let opacity = view.opacity();
+        let gain = self.model.exposure.of_renderings(self.model.config.exposure.mode);
+        let mut out = Vec::with_capacity(lights.len());
+        let mut buffers = Buffers::default();
+        // Records are eight times as large as pictures.
+        for group in lights.chunks(self.lights_together.div_ceil(8)) {
+            let shade = |block: &PreparedBlock, lights: &[OlatLight], sums: &[[f32; BLOCK]], out: &mut [_]| {
+                view.shader.records(block, lights, &view.channels, sums, out)?;
+                // Radiance, surface and subsurface.
+                for record in out.iter_mut().filter(|_| gain != Vec3::ONE) {
+                    record.as_chunks_mut::<3>().0[..3].iter_mut().for_each(|rgb| expose(rgb, gain));
+                }
+                Ok(())
+            };
+            self.group::<{ ShadedRecords::WIDTH }>(&view, group, &region, shade, &mut buffers)?;
+            for records in &buffers.images {
+                let shaded = ShadedRecords::unpack(records).map_err(error::stage("shade"))?;
+                out.push(rendering(shaded, &region, opacity.clone(), width, height));
             }
-            Ok(())
-        })?;
+        }
         Ok(out)
     }
 
-    /// How much work [`Renderer::radiance`] of one view under so many lights is.
-    pub fn work(&self, camera: &Camera, lights: usize) -> Result<RenderWork, ReconstructError> {
+    /// How much work [`Renderer::radiance`] of one view is.
+    pub fn work(&self, camera: &Camera) -> Result<RenderWork, ReconstructError> {
         let layout = self.needs.layout();
-        let view = self.view(camera, lights, &layout)?;
+        let view = self.view(camera, &layout)?;
+        let blocks = (0..view.weights.lines()).flat_map(|line| view.line(line));
+        let shaded = blocks.filter(|(_, prepared)| prepared.is_some()).map(|(block, _)| block.size[0] * block.size[1]);
         Ok(RenderWork {
-            visible: view.projection.visible().len(),
+            visible: view.visible,
             rows: view.rows.len(),
-            fixed_channels: layout.count() - view.per_light.count(),
-            light_channels: view.per_light.count(),
+            fixed_channels: layout.count() - view.channels.per_light,
+            light_channels: view.channels.per_light,
             pixels: view.size.0 * view.size.1,
-            shaded: view.region.pixels(),
+            shaded: shaded.sum(),
         })
-    }
-
-    /// Under the global gain, where exposure has one.
-    fn exposed(&self, image: Image) -> Image {
-        let gain = self.model.exposure.of_renderings(self.model.config.exposure.mode);
-        if gain == Vec3::ONE { image } else { expose(&image, gain) }
     }
 
     fn tracer(&self) -> Result<&Tracer, ReconstructError> {
@@ -155,118 +195,129 @@ impl<'m> Renderer<'m> {
         Ok(self.tracer.get_or_init(|| tracer))
     }
 
-    /// The light-independent half of a view that will be rendered under `lights` lights.
-    fn view(&self, camera: &Camera, lights: usize, layout: &ChannelLayout) -> Result<ViewHalf, ReconstructError> {
+    /// The light-independent half of a view.
+    fn view(&self, camera: &Camera, layout: &ChannelLayout) -> Result<ViewHalf, ReconstructError> {
         let (model, gaussians) = (self.model, &self.activated.gaussians);
         let projection = project(gaussians, camera, &raster_config(model)).map_err(error::stage("project"))?;
-        let visible = projection.visible();
-        let fixed = layout.filtered(|c| channel::GEOMETRY.contains(&c));
-        let features = geometry_features(&self.activated, visible, &fixed);
-        let (raster, pullback) =
-            rasterize_projected(&projection, gaussians, &features).map_err(error::stage("rasterize"))?;
-        let (width, height, _) = raster.opacity.shape();
-        let rows = if lights >= LIGHTS_TO_LOOK_AHEAD && !self.needs.hidden_rows.needed {
-            // The gradient of Σ w·f with respect to f is Σ w: 0 for Gaussians that no pixel takes anything of.
-            let mut d = RasterGrad::zeros(width, height, fixed.count());
-            d.features.data_mut().iter_mut().step_by(fixed.count()).for_each(|v| *v = 1.0);
-            let pulled = pullback.pull(&d).map_err(error::stage("rasterize.pull"))?;
-            let passes = |&&i: &&u32| pulled.features[i as usize * fixed.count()] != 0.0;
-            visible.iter().filter(passes).copied().collect()
-        } else {
-            visible.to_vec()
-        };
-        let rows = Rows::new(model, &self.activated, camera, &rows);
+        let keep = KeepAll { hidden_rows: self.needs.hidden_rows.needed, empty_blocks: self.needs.empty_pixels.needed };
+        let weights = BlendWeights::new(&projection, gaussians, &keep).map_err(error::stage("rasterize"))?;
+        let visible = projection.visible().len();
+        drop(projection);
+        let rows = Rows::new(model, &self.activated, camera, weights.rows());
+        let scaling = input_scaling(model);
         let network = match &model.network {
             Some(network) if self.needs.subsurface.needed || self.needs.incident.needed => {
                 let dark = LightRows::dark(rows.len());
                 let inputs = residual_inputs(model, &rows, &dark);
-                let (matrix, _) = inputs.assemble(&input_scaling(model)).map_err(error::stage("residual inputs"))?;
+                let (matrix, _) = inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?;
                 Some(network.many_lights(&matrix, rows.len()).map_err(error::stage("residual network"))?)
             }
             _ => None,
         };
-        let scaling = input_scaling(model);
         let transfer = transfer_config(model).filter(|_| self.needs.subsurface.needed);
         let transfer = transfer.map(|config| (rows.transfer.as_slice(), config));
         let lit =
             LitRows::new(&rows.positions, network, transfer, &scaling).map_err(error::stage("transfer vectors"))?;
-        let region = match Region::of_image(&raster.opacity) {
-            Some(region) if !self.needs.empty_pixels.needed => region,
-            _ => Region::whole(width, height),
+        let mut settings = Settings::rendering(self.model);
+        settings.shading.use_residual &= self.needs.subsurface.needed;
+        let shader = BlockShader::new(camera, &settings.shading).map_err(error::stage("shade"))?;
+        let prepared = self.prepare(&weights, &shader, layout);
+        let per_light = layout.filtered(|c| channel::TRANSPORT.contains(&c));
+        let places = TransportChannels {
+            residual: per_light.place(channel::RESIDUAL.start),
+            incident: per_light.place(channel::INCIDENT),
+            visibility: per_light.place(channel::VISIBILITY),
         };
-        let (prepared, opacity) = self.prepare(&raster, &fixed, &region, camera)?;
-        Ok(ViewHalf {
-            per_light: layout.filtered(|c| channel::TRANSPORT.contains(&c)),
-            size: (width, height),
-            projection,
-            rows,
-            lit,
-            region,
-            prepared,
-            opacity,
+        let size = (weights.size()[0], weights.size()[1]);
+        let channels = LightChannels { places, per_light: per_light.count() };
+        Ok(ViewHalf { channels, size, visible, weights, rows, lit, shader, prepared })
+    }
+
+    /// Blends the light-independent channels and prepares the blocks that show anything, line by line.
+    fn prepare(
+        &self,
+        weights: &BlendWeights,
+        shader: &BlockShader,
+        layout: &ChannelLayout,
+    ) -> Vec<Vec<Option<PreparedBlock>>> {
+        let fixed = layout.filtered(|c| channel::GEOMETRY.contains(&c));
+        let count = fixed.count();
+        let mut features = vec![0.0; weights.rows().len() * count];
+        for (row, &i) in features.chunks_exact_mut(count.max(1)).zip(weights.rows()) {
+            write_geometry(&self.activated, i as usize, &fixed, row);
+        }
+        let empty_too = self.needs.empty_pixels.needed;
+        let prepare = |block: BlendBlock<'_>, blender: &mut BlockBlender, sums: &mut [[f32; BLOCK]]| {
+            let mut blended = BlendedBlock {
+                centres: block.centres(),
+                sums: [[0.0; BLOCK]; channel::GEOMETRY.end],
+                opacity: *block.opacity,
+                depth: *block.depth,
+            };
+            if blended.is_empty() && !empty_too {
+                return None;
+            }
+            blender.blend(&block, &features, sums);
+            for c in channel::GEOMETRY {
+                if let Some(place) = fixed.place(c) {
+                    blended.sums[c] = sums[place];
+                }
+            }
+            Some(shader.prepare(&blended))
+        };
+        let line = |line| {
+            let (mut blender, mut sums) = (BlockBlender::new(), vec![[0.0; BLOCK]; count]);
+            weights.line(line).map(|block| prepare(block, &mut blender, &mut sums)).collect()
+        };
+        (0..weights.lines()).into_par_iter().map(line).collect()
+    }
+
+    /// Images of `region` with `WIDTH` channels, one for each light of a group, of what `shade` makes of the blocks. `buffers`
+    /// are empty or hold those of other lights: blocks that show nothing show nothing under any light.
+    fn group<const WIDTH: usize>(
+        &self,
+        view: &ViewHalf,
+        lights: &[OlatLight],
+        region: &Region,
+        shade: impl ShadeBlock<WIDTH>,
+        Buffers { features, images }: &mut Buffers,
+    ) -> Result<(), ReconstructError> {
+        let visibility: Vec<Vec<f32>> =
+            lights.par_iter().map(|light| self.visibility(view, light)).collect::<Result<_, _>>()?;
+        let lit: Vec<(OlatLight, &[f32])> =
+            lights.iter().zip(&visibility).map(|(light, v)| (*light, v.as_slice())).collect();
+        view.features(&lit, features)?;
+        let features = features.as_slice();
+        let lights: Vec<OlatLight> = lights.iter().map(|light| self.model.scene.scaled_light(light)).collect();
+        images.resize_with(lights.len(), || Image::new(region.width, region.height, WIDTH));
+        let lines = region.height.div_ceil(BlendWeights::BLOCK);
+        let mut bands: Vec<Vec<&mut [f32]>> = (0..lines).map(|_| Vec::with_capacity(lights.len())).collect();
+        let band = region.width * WIDTH * BlendWeights::BLOCK;
+        for image in images.iter_mut() {
+            for (bands, band) in bands.iter_mut().zip(image.data_mut().chunks_mut(band.max(1))) {
+                bands.push(band);
+            }
+        }
+        let first = region.y / BlendWeights::BLOCK;
+        bands.into_par_iter().enumerate().try_for_each(|(line, mut images)| -> Result<(), ReconstructError> {
+            let mut blender = BlockBlender::new();
+            let mut sums = vec![[0.0; BLOCK]; lights.len() * view.channels.per_light];
+            let mut pixels = vec![[[0.0; BLOCK]; WIDTH]; lights.len()];
+            for (block, prepared) in view.line(first + line) {
+                let Some(prepared) = prepared else { continue };
+                blender.blend(&block, features, &mut sums);
+                shade(prepared, &lights, &sums, &mut pixels).map_err(error::stage("shade"))?;
+                for (pixels, image) in pixels.iter().zip(&mut images) {
+                    put(pixels, image, &block, region);
+                }
+            }
+            Ok(())
         })
     }
 
-    fn prepare(
-        &self,
-        raster: &Raster,
-        fixed: &ChannelLayout,
-        region: &Region,
-        camera: &Camera,
-    ) -> Result<(Prepared, Image), ReconstructError> {
-        let cropped = |image: &Image| region.crop(image).map_err(error::stage("region"));
-        let (opacity, depth) = (cropped(&raster.opacity)?, cropped(&raster.depth)?);
-        let features = fixed.unpack(&raster.features, region);
-        let gbuffer = GBuffer { features: &features, opacity: &opacity, depth: &depth };
-        let mut settings = Settings::rendering(self.model);
-        settings.shading.use_residual &= self.needs.subsurface.needed;
-        let prepared =
-            Prepared::new(&gbuffer, &region.camera(camera), &settings.shading).map_err(error::stage("shade"))?;
-        Ok((prepared, opacity))
-    }
-
-    /// Calls `shade` with the light-dependent channels of each group of lights, cut to the view's rectangle.
-    fn each_group(
-        &self,
-        camera: &Camera,
-        lights: &[OlatLight],
-        layout: &ChannelLayout,
-        shade: &mut ShadeGroup<'_>,
-    ) -> Result<(), ReconstructError> {
-        if lights.is_empty() {
-            return Ok(());
-        }
-        let view = self.view(camera, lights.len(), layout)?;
-        let gaussians = &self.activated.gaussians;
-        let mut features = Features::zeros(0, 0);
-        for group in lights.chunks(self.lights_together) {
-            let visibility: Vec<Vec<f32>> =
-                group.par_iter().map(|light| self.visibility(&view, light, layout)).collect::<Result<_, _>>()?;
-            let lit: Vec<(OlatLight, &[f32])> =
-                group.iter().zip(&visibility).map(|(light, v)| (*light, v.as_slice())).collect();
-            let channels = view.per_light.count() * group.len();
-            if features.channels != channels {
-                // The memory of the last group before that of this one.
-                drop(std::mem::replace(&mut features, Features::zeros(0, 0)));
-                features = Features::zeros(gaussians.len(), channels);
-            }
-            view.write(&lit, &mut features)?;
-            let (raster, _) =
-                rasterize_projected(&view.projection, gaussians, &features).map_err(error::stage("rasterize"))?;
-            let transport = view.region.crop(&raster.features).map_err(error::stage("region"))?;
-            shade(&view, group, &transport)?;
-        }
-        Ok(())
-    }
-
     /// Visibility of one light from the rows of a view; empty where nothing reads it.
-    fn visibility(
-        &self,
-        view: &ViewHalf,
-        light: &OlatLight,
-        layout: &ChannelLayout,
-    ) -> Result<Vec<f32>, ReconstructError> {
-        if !self.needs.visibility.needed && layout.place(channel::VISIBILITY).is_none() {
+    fn visibility(&self, view: &ViewHalf, light: &OlatLight) -> Result<Vec<f32>, ReconstructError> {
+        if !self.needs.visibility.needed && view.channels.places.visibility.is_none() {
             return Ok(Vec::new());
         }
         if !self.model.config.visibility.traced {
@@ -277,67 +328,128 @@ impl<'m> Renderer<'m> {
     }
 }
 
+/// What the next group of lights uses again.
+#[derive(Default)]
+struct Buffers {
+    /// Rows × (lights × channels).
+    features: Vec<f32>,
+    /// One per light.
+    images: Vec<Image>,
+}
+
+/// Makes the pixels of a block under each light from the lights' blended channels.
+trait ShadeBlock<const WIDTH: usize>:
+    Fn(&PreparedBlock, &[OlatLight], &[[f32; BLOCK]], &mut [[[f32; BLOCK]; WIDTH]]) -> Result<(), ShadingError> + Sync
+{
+}
+
+impl<const WIDTH: usize, F> ShadeBlock<WIDTH> for F where
+    F: Fn(&PreparedBlock, &[OlatLight], &[[f32; BLOCK]], &mut [[[f32; BLOCK]; WIDTH]]) -> Result<(), ShadingError>
+        + Sync
+{
+}
+
+/// Multiplies three channels by the gain.
+fn expose(rgb: &mut [[f32; BLOCK]; 3], gain: Vec3) {
+    for (channel, gain) in rgb.iter_mut().zip(gain.to_array()) {
+        channel.iter_mut().for_each(|v| *v *= gain);
+    }
+}
+
+/// Writes a block into its line of an image of `region`.
+fn put<const WIDTH: usize>(pixels: &[[f32; BLOCK]; WIDTH], image: &mut [f32], block: &BlendBlock<'_>, region: &Region) {
+    const SIDE: usize = BlendWeights::BLOCK;
+    let at = (block.at[0] - region.x) * WIDTH;
+    for (row, image) in image.chunks_exact_mut(region.width * WIDTH).enumerate() {
+        let mut line = [[0.0; WIDTH]; SIDE];
+        for c in 0..WIDTH {
+            let plane = &pixels[c].as_chunks::<SIDE>().0[row];
+            for column in 0..SIDE {
+                line[column][c] = plane[column];
+            }
+        }
+        let to = &mut image[at..at + block.size[0] * WIDTH];
+        match to.as_chunks_mut::<SIDE>() {
+            // All columns: a copy of known length.
+            (to, []) if to.len() == WIDTH => to.copy_from_slice(line.as_flattened().as_chunks().0),
+            _ => to.copy_from_slice(&line.as_flattened()[..to.len()]),
+        }
+    }
+}
+
 /// The light-independent half of a view.
 struct ViewHalf {
     /// The light-dependent channels of one light.
-    per_light: ChannelLayout,
+    channels: LightChannels,
     /// Width and height.
     size: (usize, usize),
-    projection: Projection,
+    /// Gaussians in the view.
+    visible: usize,
+    weights: BlendWeights,
     /// Of the Gaussians that pass something to a pixel.
     rows: Rows,
     /// The same, ready for lights.
     lit: LitRows,
-    /// Outside of it no Gaussian covers anything.
-    region: Region,
-    prepared: Prepared,
-    /// Of the region.
-    opacity: Image,
+    shader: BlockShader,
+    /// By line, the blocks that show something.
+    prepared: Vec<Vec<Option<PreparedBlock>>>,
 }
 
 impl ViewHalf {
-    /// Places of a light's channels, of which the first is `first`.
-    fn channels(&self, first: usize) -> TransportChannels {
-        let at = |c: usize| self.per_light.place(c).map(|place| first + place);
-        TransportChannels {
-            residual: at(channel::RESIDUAL.start),
-            incident: at(channel::INCIDENT),
-            visibility: at(channel::VISIBILITY),
-        }
+    /// The blocks of a line, with those that show something prepared.
+    fn line(&self, line: usize) -> impl Iterator<Item = (BlendBlock<'_>, &Option<PreparedBlock>)> {
+        self.weights.line(line).zip(&self.prepared[line])
     }
 
-    /// Writes the channels of all `lights` into the feature rows of the view's rows.
-    fn write(&self, lights: &[(OlatLight, &[f32])], features: &mut Features) -> Result<(), ReconstructError> {
-        let (rows, width) = (&self.rows.visible, features.channels);
-        let channels = LightChannels { places: self.channels(0), per_light: self.per_light.count() };
-        // Rows ascend: each task has a piece of its own.
-        let (mut pieces, mut rest, mut start) = (Vec::new(), features.data.as_mut_slice(), 0);
-        for rows in rows.chunks(LitRows::TASK_ROWS) {
-            let end = rows[rows.len() - 1] as usize + 1;
-            let (piece, after) = rest.split_at_mut((end - start) * width);
-            pieces.push((start, piece));
-            (rest, start) = (after, end);
+    /// The least rectangle of whole lines of blocks that holds all blocks.
+    fn region(&self) -> Region {
+        let mut region: Option<Region> = None;
+        for (block, _) in (0..self.weights.lines()).flat_map(|line| self.line(line)) {
+            let [x, y] = block.at;
+            let one = Region { x, y, width: block.size[0], height: block.size[1] };
+            region = Region::union(region, Some(one));
         }
+        region.unwrap_or(Region::whole(self.size.0, self.size.1))
+    }
+
+    /// Σ w of the whole picture.
+    fn opacity(&self) -> Image {
+        let mut image = Image::new(self.size.0, self.size.1, 1);
+        let whole = Region::whole(self.size.0, self.size.1);
+        let band = (self.size.0 * BlendWeights::BLOCK).max(1);
+        for (line, band) in image.data_mut().chunks_mut(band).enumerate() {
+            for (block, _) in self.line(line) {
+                put(&[*block.opacity], band, &block, &whole);
+            }
+        }
+        image
+    }
+
+    /// The channels of all `lights`, row by row.
+    fn features(&self, lights: &[(OlatLight, &[f32])], features: &mut Vec<f32>) -> Result<(), ReconstructError> {
+        let width = self.channels.per_light * lights.len();
+        features.resize(self.rows.len() * width, 0.0);
         // Asked here: the setting belongs to the thread that called.
         let level = Level::current();
-        pieces.into_par_iter().enumerate().try_for_each(|(task, (start, piece))| {
+        let tasks = features.par_chunks_mut((LitRows::TASK_ROWS * width).max(1));
+        tasks.enumerate().try_for_each(|(task, piece)| {
+            let first = task * LitRows::TASK_ROWS;
             let put = |row: usize, values: &[f32]| {
-                let at = (rows[row] as usize - start) * width;
-                piece[at..at + width].copy_from_slice(values);
+                piece[(row - first) * width..][..width].copy_from_slice(values);
             };
-            self.lit.task(task, level, lights, &channels, put).map_err(error::stage("residual network"))
+            self.lit.task(task, level, lights, &self.channels, put).map_err(error::stage("residual network"))
         })
     }
 }
 
-fn rendering(shaded: Shaded, region: &Region, opacity: &Image, width: usize, height: usize) -> Rendering {
+fn rendering(shaded: Shaded, region: &Region, opacity: Image, width: usize, height: usize) -> Rendering {
     let whole = |part: &Image| region.paste(part, width, height);
     let m = &shaded.maps;
     Rendering {
         radiance: whole(&shaded.radiance),
         surface: whole(&shaded.surface),
         subsurface: whole(&shaded.subsurface),
-        opacity: whole(opacity),
+        opacity,
         maps: ShadedMaps {
             base_color: whole(&m.base_color),
             roughness: whole(&m.roughness),

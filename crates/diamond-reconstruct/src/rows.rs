@@ -153,19 +153,22 @@ pub(crate) fn transfer_config(model: &Model) -> Option<TransferConfig> {
 pub(crate) fn geometry_features(activated: &Activated, visible: &[u32], layout: &ChannelLayout) -> Features {
     let mut features = Features::zeros(activated.gaussians.len(), layout.count());
     for &i in visible {
-        let i = i as usize;
-        let row = features.row_mut(i);
-        for (c, v) in channel::BASE_COLOR.zip(activated.base_color[i].to_array()) {
-            layout.put(row, c, v);
-        }
-        layout.put(row, channel::ROUGHNESS, activated.roughness[i]);
-        layout.put(row, channel::METALNESS, activated.metalness[i]);
-        layout.put(row, channel::SUBSURFACENESS, activated.subsurfaceness[i]);
-        for (c, v) in channel::NORMAL.zip(activated.normals[i].to_array()) {
-            layout.put(row, c, v);
-        }
+        write_geometry(activated, i as usize, layout, features.row_mut(i as usize));
     }
     features
+}
+
+/// Writes the light-independent channels of a Gaussian.
+pub(crate) fn write_geometry(activated: &Activated, i: usize, layout: &ChannelLayout, row: &mut [f32]) {
+    for (c, v) in channel::BASE_COLOR.zip(activated.base_color[i].to_array()) {
+        layout.put(row, c, v);
+    }
+    layout.put(row, channel::ROUGHNESS, activated.roughness[i]);
+    layout.put(row, channel::METALNESS, activated.metalness[i]);
+    layout.put(row, channel::SUBSURFACENESS, activated.subsurfaceness[i]);
+    for (c, v) in channel::NORMAL.zip(activated.normals[i].to_array()) {
+        layout.put(row, c, v);
+    }
 }
 
 /// Residual and incident light of each row: network and transfer vectors together.

@@ -236,10 +236,11 @@ fn rendering_agrees_with_everything_rendered() {
     assert!(renderer.radiance(&view.camera, &lights[5..6]).expect("renders")[0] == pictures[5]);
     let maps = renderer.renderings(&view.camera, &lights[..2]).expect("renders");
     assert!(maps[1].radiance == pictures[1] && maps[1].maps.visibility.data().iter().any(|v| *v > 0.0));
-    let work = renderer.work(&view.camera, lights.len()).expect("a view");
+    let work = renderer.work(&view.camera).expect("a view");
     assert!(work.rows < work.visible && work.shaded < work.pixels, "{work:?}");
     assert_eq!((work.fixed_channels, work.light_channels), (9, 4));
-    assert_eq!(renderer.work(&view.camera, 1).expect("a view").rows, work.visible);
+    let all = Renderer::with_needs(&model, RenderNeeds::everything()).work(&view.camera).expect("a view");
+    assert_eq!((all.rows, all.shaded), (work.visible, work.pixels));
 
     // Nothing metallic, nothing subsurface: left out, and no value changes by more than about NIL.
     let nil = diamond_reconstruct::logit(0.5 * diamond_reconstruct::NIL);
@@ -249,7 +250,7 @@ fn rendering_agrees_with_everything_rendered() {
     let renderer = Renderer::new(&model);
     assert!(!renderer.needs().metal.needed && !renderer.needs().subsurface.needed);
     let pictures = renderer.radiance(&view.camera, &lights).expect("renders");
-    let work = renderer.work(&view.camera, lights.len()).expect("a view");
+    let work = renderer.work(&view.camera).expect("a view");
     assert_eq!((work.fixed_channels, work.light_channels), (7, 1));
     let brightest = pictures.iter().flat_map(|p| p.data()).fold(1.0f32, |m, v| m.max(*v));
     for (a, b) in pictures.iter().zip(everything(&model)) {

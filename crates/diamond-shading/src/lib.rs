@@ -44,6 +44,7 @@
 //! # Ok::<(), diamond_shading::ShadingError>(())
 //! ```
 mod angles;
+mod block_shader;
 mod brdf;
 mod deferred;
 mod encoding;
@@ -72,6 +73,7 @@ mod transfer;
 mod vector;
 
 pub use angles::{Angles, AnglesGrad, DirectionsGrad};
+pub use block_shader::{BlendedBlock, BlockShader, PreparedBlock, ShadedRecords};
 pub use brdf::{BrdfModel, CosineFloor, Diffuse, ReflectGrad};
 pub use deferred::{Combine, IncidentModel, ShadePullback, ShadingConfig, SurfaceVisibility, shade, shade_at};
 pub use encoding::{

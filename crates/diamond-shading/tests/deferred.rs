@@ -4,8 +4,9 @@ use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_image::Image;
 use diamond_light::{Falloff, OlatLight};
 use diamond_shading::{
-    BrdfModel, Combine, Diffuse, Fresnel, GBuffer, GBufferGrad, IncidentModel, MIN_COS_THETA_O, Masking, Prepared,
-    Shaded, ShadedGrad, ShadedMapsGrad, ShadingConfig, SurfaceVisibility, TransportChannels, channel, shade,
+    BlendedBlock, BlockShader, BrdfModel, Combine, Diffuse, Fresnel, GBuffer, GBufferGrad, IncidentModel,
+    LightChannels, MIN_COS_THETA_O, Masking, Prepared, Shaded, ShadedGrad, ShadedMapsGrad, ShadedRecords,
+    ShadingConfig, SurfaceVisibility, TransportChannels, channel, shade,
 };
 use diamond_testkit::adjoint::{dot, worst, worst_relative};
 use diamond_testkit::deferred::{Incident, OUTPUTS, Setting};
@@ -335,6 +336,55 @@ proptest! {
         prop_assert_eq!(&radiance, &expected.radiance);
         let beyond = TransportChannels { visibility: Some(14), ..channels };
         prop_assert!(prepared.radiance(&light, &images[0], &beyond).is_err());
+    }
+
+    /// Blocks of pixels from anywhere, shaded without images: the same bits, whatever light comes before.
+    #[test]
+    fn blocks_have_the_bits_of_images(x in view(), lights in [light(), light()], config in config()) {
+        let camera = camera();
+        let images = split(&x, &[channel::COUNT, 1, 1]);
+        let gbuffer = GBuffer { features: &images[0], opacity: &images[1], depth: &images[2] };
+        let shader = BlockShader::new(&camera, &config).expect("settings are in range");
+        let places = TransportChannels { residual: Some(0), incident: Some(3), visibility: Some(4) };
+        let channels = LightChannels { places, per_light: 5 };
+        // Pixels in an order of their own; those beyond the last are empty.
+        let pixels: Vec<(usize, usize)> = (0..W * H).map(|i| (i / H, i % H)).collect();
+        for pixels in pixels.chunks(16) {
+            let mut block = BlendedBlock {
+                centres: [[0.5; 16]; 2], sums: [[0.0; 16]; 9], opacity: [0.0; 16], depth: [0.0; 16],
+            };
+            let mut sums = [[0.0; 16]; 10];
+            for (lane, &(x, y)) in pixels.iter().enumerate() {
+                (block.centres[0][lane], block.centres[1][lane]) = (x as f32 + 0.5, y as f32 + 0.5);
+                let features = images[0].pixel(x, y);
+                (0..9).for_each(|c| block.sums[c][lane] = features[c]);
+                (0..10).for_each(|c| sums[c][lane] = features[9 + c % 5]);
+                (block.opacity[lane], block.depth[lane]) = (images[1].pixel(x, y)[0], images[2].pixel(x, y)[0]);
+            }
+            let prepared = shader.prepare(&block);
+            let (mut radiance, mut records) = ([[[0.0; 16]; 3]; 2], [[[0.0; 16]; ShadedRecords::WIDTH]; 2]);
+            shader.radiance(&prepared, &lights, &channels, &sums, &mut radiance).expect("lengths agree");
+            shader.records(&prepared, &lights, &channels, &sums, &mut records).expect("lengths agree");
+            for (k, light) in lights.iter().enumerate() {
+                let (expected, _) = shade(&gbuffer, &camera, light, &config).expect("shapes agree");
+                let record = Image::from_vec(16, 1, ShadedRecords::WIDTH, (0..16).flat_map(|lane| {
+                    records[k].iter().map(move |c| c[lane]).collect::<Vec<f32>>()
+                }).collect()).expect("sizes agree");
+                let record = ShadedRecords::unpack(&record).expect("records");
+                for (lane, &(x, y)) in pixels.iter().enumerate() {
+                    let found = [radiance[k][0][lane], radiance[k][1][lane], radiance[k][2][lane]];
+                    prop_assert_eq!(expected.radiance.pixel(x, y), &found);
+                    prop_assert_eq!(record.radiance.pixel(lane, 0), &found);
+                    prop_assert_eq!(record.subsurface.pixel(lane, 0), expected.subsurface.pixel(x, y));
+                    prop_assert_eq!(record.maps.normal.pixel(lane, 0), expected.maps.normal.pixel(x, y));
+                    prop_assert_eq!(record.maps.depth.pixel(lane, 0), expected.maps.depth.pixel(x, y));
+                }
+            }
+            prop_assert!(shader.radiance(&prepared, &lights, &channels, &sums[1..], &mut radiance).is_err());
+            prop_assert!(shader.radiance(&prepared, &lights, &channels, &sums, &mut radiance[1..]).is_err());
+            let few = LightChannels { places, per_light: 4 };
+            prop_assert!(shader.radiance(&prepared, &lights, &few, &sums[..8], &mut radiance).is_err());
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use crate::Features;
 use crate::bins::{Bins, COLUMNS, REGION, ROWS, Reached, Scratch, grid};
 use crate::ellipse::{BLOCK, LANES, Prepared};
 use crate::lanes::{Limits, Offsets, Thresholds, alphas, composite};
-use crate::recycle::FLOATS;
+use crate::recycle::{ENTRIES, FLOATS, Pool};
 use diamond_simd::{Block, Simd, WithSimd, any_positive, load_block, store_block, with_lanes};
 
 /// Entries of a block that are prepared and blended together.
@@ -30,6 +30,8 @@ pub(crate) struct Scene<'a> {
     pub smooth: bool,
     /// Whether weights above 0 are counted.
     pub count: bool,
+    /// Whether blocks are kept with their weights.
+    pub keep: bool,
     pub width: usize,
     pub height: usize,
 }
@@ -106,6 +108,47 @@ pub(crate) struct RegionImage {
     pub data: Vec<f32>,
     pub lists: Reached,
     pub work: RegionWork,
+    /// Empty unless asked for.
+    pub kept: KeptBlocks,
+}
+
+/// Blocks of a region with the weights of what is seen in them.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct KeptBlocks {
+    /// By number of the block; those of which something is seen.
+    pub blocks: Vec<KeptBlock>,
+    /// Gaussians, block by block, nearest first.
+    pub gaussians: Vec<u32>,
+    /// By pixel of a block, some of them above 0; beside `gaussians`.
+    pub weights: Vec<[f32; LANES]>,
+}
+
+static WEIGHTS: Pool<[f32; LANES]> = Pool::new();
+
+impl KeptBlocks {
+    /// None yet.
+    fn new() -> Self {
+        Self { blocks: Vec::new(), gaussians: ENTRIES.take(), weights: WEIGHTS.take() }
+    }
+}
+
+impl Drop for KeptBlocks {
+    fn drop(&mut self) {
+        ENTRIES.give(std::mem::take(&mut self.gaussians));
+        WEIGHTS.give(std::mem::take(&mut self.weights));
+    }
+}
+
+/// A block with something to see.
+#[derive(Debug, Clone)]
+pub(crate) struct KeptBlock {
+    pub place: Place,
+    /// Its entries end here.
+    pub end: usize,
+    /// Σ w by pixel.
+    pub opacity: [f32; LANES],
+    /// Σ w z by pixel.
+    pub depth: [f32; LANES],
 }
 
 /// How much was done.
@@ -152,9 +195,11 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
     let [width, height] = scene.region_size(region);
     let channels = scene.channels;
     let mut data = FLOATS.take();
-    data.resize(width * height * (channels + 2), 0.0);
-    let (features, rest) = data.split_at_mut(width * height * channels);
-    let (opacity, depth) = rest.split_at_mut(width * height);
+    // Images are not made where blocks are kept.
+    let pixels = if scene.keep { 0 } else { width * height };
+    data.resize(pixels * (channels + 2), 0.0);
+    let (features, rest) = data.split_at_mut(pixels * channels);
+    let (opacity, depth) = rest.split_at_mut(pixels);
     let groups = scene.groups();
     let limits = Limits::new(s, &scene.limits);
     let offsets = Offsets::<S, N>::new();
@@ -165,6 +210,7 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
     let mut entries = [0u32; BATCH];
     let mut rows = [0usize; BATCH];
     let mut weights = [[0.0f32; LANES]; BATCH];
+    let mut kept = if scene.keep { KeptBlocks::new() } else { KeptBlocks::default() };
     let mut work = RegionWork { entries: scratch.entries(), ..Default::default() };
     for block in 0..ROWS * COLUMNS {
         lists.begin();
@@ -231,6 +277,14 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
                 let positive = |w: &[f32; LANES]| w.iter().filter(|w| **w > 0.0).count() as u64;
                 work.blended += weights[..n].iter().map(positive).sum::<u64>();
             }
+            if scene.keep {
+                for (w, &slot) in weights[..n].iter().zip(&entries) {
+                    if any_positive::<S, N>(s, &load_block::<S, N>(w)) {
+                        kept.gaussians.push(scratch.slots[slot as usize].gaussian);
+                        kept.weights.push(*w);
+                    }
+                }
+            }
             if any_positive::<S, N>(s, &t) {
                 lists.push(&entries[..n]);
                 n = slots.next(&mut entries);
@@ -245,6 +299,14 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
         }
         let mut total = [0.0f32; LANES];
         store_block::<S, N>(&mut total, sum);
+        if scene.keep {
+            let end = kept.gaussians.len();
+            if end == kept.blocks.last().map_or(0, |b| b.end) {
+                continue;
+            }
+            kept.blocks.push(KeptBlock { place, end, opacity: total, depth: acc[channels] });
+            continue;
+        }
         for line in 0..place.size[1] {
             let first = (place.y - corner_y + line) * width + place.x - corner_x;
             let (lanes, pixels) = (line * BLOCK..line * BLOCK + place.size[0], first..first + place.size[0]);
@@ -260,5 +322,5 @@ fn forward<S: Simd, const N: usize, const SMOOTH: bool>(s: S, region: RegionForw
             }
         }
     }
-    RegionImage { data, lists, work }
+    RegionImage { data, lists, work, kept }
 }

@@ -3,6 +3,7 @@
 //! Invariant: this crate knows nothing of materials, lights or images from disk: it blends feature channels.
 mod bins;
 mod blend;
+mod blend_weights;
 mod bvh;
 mod config;
 pub mod density;
@@ -25,6 +26,7 @@ mod visibility;
 mod whole_file;
 mod wide;
 
+pub use blend_weights::{BlendBlock, BlendWeights, BlockBlender, KeepAll};
 pub use config::{Cutoff, RasterConfig};
 pub use error::SplatError;
 pub use factor::LowerFactor;

@@ -136,13 +136,7 @@ fn blend<'a>(
     level: Level,
 ) -> Result<(Raster, RasterPullback<'a>), SplatError> {
     let n = gaussians.len();
-    if projection.radii().len() != n {
-        return Err(SplatError::Shape {
-            what: "Projection (of other Gaussians)",
-            expected: format!("{n} Gaussians"),
-            found: projection.radii().len().to_string(),
-        });
-    }
+    check_same(&projection, n)?;
     let channels = features.channels;
     if features.data.len() != n * channels {
         features.validate(n)?;
@@ -174,6 +168,16 @@ fn blend<'a>(
     };
     let lists = regions.into_iter().map(take_lists).collect();
     Ok((raster, RasterPullback { gaussians, features, projection, lists, level }))
+}
+
+/// Whether the projection is one of so many Gaussians.
+pub(crate) fn check_same(projection: &Projection, gaussians: usize) -> Result<(), SplatError> {
+    let found = projection.radii().len();
+    if found == gaussians {
+        return Ok(());
+    }
+    let expected = format!("{gaussians} Gaussians");
+    Err(SplatError::Shape { what: "Projection (of other Gaussians)", expected, found: found.to_string() })
 }
 
 /// Copies the regions into the images.
@@ -209,14 +213,14 @@ fn assemble(raster: &mut Raster, scene: &Scene, regions: &[RegionImage]) {
 }
 
 /// Runs `f` with the buffers of this thread.
-fn with_scratch<T>(f: impl FnOnce(&mut Scratch) -> T) -> T {
+pub(crate) fn with_scratch<T>(f: impl FnOnce(&mut Scratch) -> T) -> T {
     thread_local! {
         static SCRATCH: RefCell<Scratch> = RefCell::default();
     }
     SCRATCH.with_borrow_mut(f)
 }
 
-fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -> Scene<'a> {
+pub(crate) fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -> Scene<'a> {
     let config = &projection.config;
     let smooth = is_smooth(config);
     Scene {
@@ -231,6 +235,7 @@ fn scene<'a>(projection: &'a Projection, features: &'a Features, level: Level) -
         },
         smooth,
         count: config.count_blended,
+        keep: false,
         width: projection.camera.intrinsics.width as usize,
         height: projection.camera.intrinsics.height as usize,
     }

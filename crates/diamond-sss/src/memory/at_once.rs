@@ -1,5 +1,5 @@
 //! How much is held at once where less would do: time depends on it, results do not.
-use diamond_reconstruct::{Config, LIGHTS_PER_RASTERISATION, Model, Renderer};
+use diamond_reconstruct::{Config, LIGHTS_TOGETHER, Model, Renderer};
 use serde::Serialize;
 
 /// Bytes that the pictures of one group of lights may occupy, unless told otherwise.
@@ -25,7 +25,7 @@ impl Default for AtOnce {
         Self {
             photographs: 0,
             buffers: diamond_splat::KEPT_BYTES as u64,
-            lights: LIGHTS_PER_RASTERISATION,
+            lights: LIGHTS_TOGETHER,
             pictures: PICTURE_BYTES,
             decode_in_parallel: true,
         }
