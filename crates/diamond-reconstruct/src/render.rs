@@ -12,7 +12,7 @@ use crate::forward::{Settings, raster_config};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
-use crate::visibility_cache::Tracer;
+use crate::visibility_cache::{LightKey, Tracer, key};
 use crate::{Activated, CaptureFacts, Model, Needs, ReconstructError, Rendering, error};
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -25,11 +25,14 @@ use diamond_simd::{BLOCK, Level};
 use diamond_splat::{BlendBlock, BlendWeights, BlockBlender, KeepAll, project};
 use glam::Vec3;
 use rayon::prelude::*;
-use std::sync::OnceLock;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// Lights that go through the rows and pixels of a view together, unless told otherwise: bounds the memory of their
 /// channels.
 pub const LIGHTS_TOGETHER: usize = 12;
+/// Bytes of the pictures of lights that go together, unless told otherwise: large pictures go in smaller groups.
+pub const PICTURE_BYTES: usize = 256 << 20;
 
 /// A model ready to be rendered from any number of views.
 pub struct Renderer<'m> {
@@ -39,6 +42,10 @@ pub struct Renderer<'m> {
     /// Built when the first light needs it.
     tracer: OnceLock<Tracer>,
     lights_together: usize,
+    picture_bytes: usize,
+    /// Bytes of visibility that are kept from one view to the next.
+    kept_bytes: usize,
+    kept: Mutex<BTreeMap<LightKey, Arc<Vec<f32>>>>,
 }
 
 /// How much work a view was.
@@ -63,19 +70,50 @@ impl<'m> Renderer<'m> {
     pub fn new(model: &'m Model) -> Self {
         let activated = model.parameters.activate();
         let needs = Needs::decide(&model.config, &CaptureFacts::default()).rendering(&activated);
-        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_TOGETHER }
+        Self::of(model, activated, needs)
     }
 
     /// Of a model with given decisions on what is computed.
     pub fn with_needs(model: &'m Model, needs: RenderNeeds) -> Self {
-        let activated = model.parameters.activate();
-        Self { model, activated, needs, tracer: OnceLock::new(), lights_together: LIGHTS_TOGETHER }
+        Self::of(model, model.parameters.activate(), needs)
+    }
+
+    fn of(model: &'m Model, activated: Activated, needs: RenderNeeds) -> Self {
+        Self {
+            model,
+            activated,
+            needs,
+            tracer: OnceLock::new(),
+            lights_together: LIGHTS_TOGETHER,
+            picture_bytes: PICTURE_BYTES,
+            kept_bytes: 0,
+            kept: Mutex::default(),
+        }
     }
 
     /// With so many lights going through a view together (at least 1; [`LIGHTS_TOGETHER`] unless told otherwise): memory
     /// and time depend on it, pictures do not.
     pub fn with_lights_together(self, lights: usize) -> Self {
         Self { lights_together: lights.max(1), ..self }
+    }
+
+    /// With groups of lights whose pictures occupy at most so many bytes ([`PICTURE_BYTES`] unless told otherwise), or
+    /// of one light.
+    pub fn with_picture_bytes(self, bytes: usize) -> Self {
+        Self { picture_bytes: bytes, ..self }
+    }
+
+    /// Keeps the traced visibility of lights, which does not depend on the view, for the views that follow: four bytes
+    /// per Gaussian and light, so many bytes in all (none unless told otherwise). A light is then traced for all
+    /// Gaussians and not only for those that a view shows. Pictures have the same bits.
+    pub fn with_kept_visibility(self, bytes: usize) -> Self {
+        Self { kept_bytes: bytes, ..self }
+    }
+
+    /// Lights that go together where a picture has so many pixels.
+    fn group_of(&self, (width, height): (usize, usize)) -> usize {
+        let bytes = (width * height).saturating_mul(3 * size_of::<f32>()).max(1);
+        (self.picture_bytes / bytes).clamp(1, self.lights_together)
     }
 
     /// What is computed, and why.
@@ -91,7 +129,7 @@ impl<'m> Renderer<'m> {
         let mut out = Vec::with_capacity(lights.len());
         let view = self.view(camera, &self.needs.layout())?;
         let mut buffers = Buffers::default();
-        for group in lights.chunks(self.lights_together) {
+        for group in lights.chunks(self.group_of(view.size)) {
             self.radiance_group(&view, group, &mut buffers)?;
             out.append(&mut buffers.images);
         }
@@ -113,11 +151,11 @@ impl<'m> Renderer<'m> {
             return Ok(());
         }
         let view = self.view(camera, &self.needs.layout())?;
-        let mut buffers = Buffers::default();
-        for (g, group) in lights.chunks(self.lights_together).enumerate() {
+        let (mut buffers, together) = (Buffers::default(), self.group_of(view.size));
+        for (g, group) in lights.chunks(together).enumerate() {
             self.radiance_group(&view, group, &mut buffers)?;
             for (k, image) in buffers.images.iter().enumerate() {
-                see(g * self.lights_together + k, image)?;
+                see(g * together + k, image)?;
             }
         }
         Ok(())
@@ -153,7 +191,7 @@ impl<'m> Renderer<'m> {
         let mut out = Vec::with_capacity(lights.len());
         let mut buffers = Buffers::default();
         // Records are eight times as large as pictures.
-        for group in lights.chunks(self.lights_together.div_ceil(8)) {
+        for group in lights.chunks(self.group_of(view.size).div_ceil(8)) {
             let shade = |block: &PreparedBlock, lights: &[OlatLight], sums: &[[f32; BLOCK]], out: &mut [_]| {
                 view.shader.records(block, lights, &view.channels, sums, out)?;
                 // Radiance, surface and subsurface.
@@ -324,7 +362,33 @@ impl<'m> Renderer<'m> {
             return Ok(LightRows::new(self.model, &view.rows, light, VisibilitySource::Fitted)?.visibility);
         }
         let Activated { gaussians, normals, .. } = &self.activated;
-        self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible)
+        // Without room for one more light what is kept stays: with more lights than that, each would push out the next.
+        let room = |kept: &BTreeMap<_, _>| (kept.len() + 1) * gaussians.len() * size_of::<f32>() <= self.kept_bytes;
+        let found = {
+            let kept = self.kept();
+            match kept.get(&key(light)) {
+                Some(found) => Some(Arc::clone(found)),
+                None if !room(&kept) => return self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible),
+                None => None,
+            }
+        };
+        let all = match found {
+            Some(all) => all,
+            None => {
+                let all = Arc::new(self.tracer()?.trace(gaussians, normals, light)?);
+                let mut kept = self.kept();
+                if room(&kept) {
+                    kept.insert(key(light), Arc::clone(&all));
+                }
+                all
+            }
+        };
+        Ok(view.rows.visible.iter().map(|&i| all[i as usize]).collect())
+    }
+
+    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Arc<Vec<f32>>>> {
+        // Whoever panicked with the lock held left whole entries behind.
+        self.kept.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 }
 

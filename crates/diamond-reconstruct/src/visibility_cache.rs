@@ -20,7 +20,7 @@ use std::path::Path;
 use std::sync::OnceLock;
 
 /// Bits that identify a light: position or direction. Intensity does not change visibility.
-type LightKey = [u32; 4];
+pub(crate) type LightKey = [u32; 4];
 
 /// Visibility toward one light.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,7 +68,7 @@ const MAX_LIGHTS: usize = 512;
 /// Share of the Gaussians that may have moved farther before visibility counts as changed.
 pub const MOVED_SHARE: f64 = 0.01;
 
-fn key(light: &OlatLight) -> LightKey {
+pub(crate) fn key(light: &OlatLight) -> LightKey {
     let (kind, v) = match *light {
         OlatLight::Point { position, .. } => (0, position),
         OlatLight::Directional { direction, .. } => (1, direction),

@@ -211,6 +211,37 @@ fn hidden_gaussians_are_not_pulled() {
     println!("{backward} of {forward} rows pulled, worst gradient {worst:.1e}");
 }
 
+/// Visibility that is kept from one view to the next does not change a bit, nor does room for a few of the lights only.
+#[test]
+fn views_share_the_visibility_of_lights() {
+    let mut config = short("resolved");
+    config.initial.count = 800;
+    let mut run = Reconstruction::new(capture(), &config).expect("starts");
+    (0..3).for_each(|_| assert!(run.step().is_ok()));
+    let model = run.model().expect("a model").clone();
+    assert!(model.config.visibility.traced);
+    let cameras: Vec<_> = run.capture().train.iter().take(3).map(|view| view.camera).collect();
+    let lights: Vec<OlatLight> = run.capture().train[0].shots.iter().map(|shot| shot.light).collect();
+    let bytes_of_one = 4 * model.parameters.len();
+    for bytes in [usize::MAX, 2 * bytes_of_one + 1] {
+        let keeping = Renderer::new(&model).with_kept_visibility(bytes);
+        for camera in &cameras {
+            let expected = Renderer::new(&model).radiance(camera, &lights).expect("renders");
+            assert!(keeping.radiance(camera, &lights).expect("renders") == expected, "pictures differ");
+            // One by one, in groups of another size.
+            let keeping = Renderer::new(&model).with_kept_visibility(bytes).with_lights_together(3);
+            let mut seen = 0;
+            let see = |k: usize, image: &diamond_image::Image| -> Result<(), diamond_reconstruct::ReconstructError> {
+                assert!(k == seen && *image == expected[k], "picture {k} differs");
+                seen += 1;
+                Ok(())
+            };
+            keeping.each_radiance(camera, &lights, see).expect("renders");
+            assert_eq!(seen, lights.len());
+        }
+    }
+}
+
 /// Pictures agree with those of a renderer that leaves nothing out: bit for bit, but for parts that are nil.
 #[test]
 fn rendering_agrees_with_everything_rendered() {

@@ -330,11 +330,15 @@ mod tests {
             let rotation = Quat::from_xyzw(uniform(), uniform(), uniform(), 1.0).normalize();
             gaussians.push(mean, scale, rotation, uniform());
         }
+        // One behind others that let nothing through.
+        for (mean, scale) in [(Vec3::new(-1.2, 0.0, 5.0), 0.3); 4].into_iter().chain([(Vec3::new(-1.92, 0.0, 8.0), 0.02)]) {
+            gaussians.push(mean, Vec3::splat(scale), Quat::IDENTITY, 0.99);
+        }
         let camera = Camera { intrinsics: Intrinsics::from_fov_x(0.9, 139, 71), pose: Pose::IDENTITY };
         let projection = project(&gaussians, &camera, &RasterConfig::default()).unwrap();
         for (channels, all) in [(0, false), (3, false), (4, true), (13, false), (75, false)] {
             let keep = KeepAll { hidden_rows: all, empty_blocks: all };
-            let values: Vec<f32> = (0..700 * channels).map(|_| uniform() - 0.5).collect();
+            let values: Vec<f32> = (0..gaussians.len() * channels).map(|_| uniform() - 0.5).collect();
             let features = Features { channels, data: values };
             let (raster, pullback) = rasterize_projected(&projection, &gaussians, &features).unwrap();
             let weights = BlendWeights::new(&projection, &gaussians, &keep).unwrap();

@@ -131,11 +131,11 @@ pub(crate) fn evaluate_with(
     let renderer = at_once.renderer(model);
     for (v, view) in capture.test.iter().enumerate() {
         let lights: Vec<_> = view.shots.iter().map(|s| s.light).collect();
-        render_lights(&renderer, at_once, &view.camera, &lights, |s, picture| {
+        render_lights(&renderer, &view.camera, &lights, |s, picture| {
             let shot = &view.shots[s];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);
-            let bytes = to_display(&picture);
+            let bytes = to_display(picture);
             let as_image = |bytes: &[u8]| {
                 Image::from_vec(width, height, 3, bytes.iter().map(|b| f32::from(*b) / 255.0).collect())
                     .map_err(|e| SssError::Internal(e.to_string()))

@@ -4,7 +4,7 @@ use crate::relight::{render_lights, render_sum};
 use crate::{CameraChoice, LightChoice, RunRecord, SssError, cameras_of, encode_exr, write_output};
 use diamond_image::Image;
 use diamond_light::OlatLight;
-use diamond_reconstruct::{Model, Renderer};
+use diamond_reconstruct::Model;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 
@@ -69,18 +69,18 @@ pub fn render_folder(
         progress(written.len(), total);
         Ok(())
     };
-    let renderer = Renderer::new(&model);
+    let renderer = crate::AtOnce::default().renderer(&model);
     for (name, camera) in cameras {
         let camera = options.size.map_or(camera, |(w, h)| camera.resized(w, h));
         if mixes.iter().all(|m| m.lights.len() == 1) {
             // One projection serves all lights of the view.
             let lights: Vec<OlatLight> = mixes.iter().map(|m| m.lights[0]).collect();
-            render_lights(&renderer, &crate::AtOnce::default(), &camera, &lights, |i, picture| {
-                store(&picture, &name, &mixes[i].name)
+            render_lights(&renderer, &camera, &lights, |i, picture| {
+                store(picture, &name, &mixes[i].name)
             })?;
         } else {
             for mix in &mixes {
-                store(&render_sum(&model, &camera, &mix.lights)?, &name, &mix.name)?;
+                store(&render_sum(&renderer, &camera, &mix.lights)?, &name, &mix.name)?;
             }
         }
     }

@@ -1,9 +1,10 @@
 //! How much is held at once where less would do: time depends on it, results do not.
-use diamond_reconstruct::{Config, LIGHTS_TOGETHER, Model, Renderer};
+use diamond_reconstruct::{Config, LIGHTS_TOGETHER, Model, PICTURE_BYTES, Renderer};
 use serde::Serialize;
 
-/// Bytes that the pictures of one group of lights may occupy, unless told otherwise.
-const PICTURE_BYTES: u64 = 256 << 20;
+/// Bytes of traced visibility that are kept from one view to the next, unless told otherwise: 112 lights of 150,000
+/// Gaussians.
+const VISIBILITY_BYTES: u64 = 64 << 20;
 
 /// How much is held at once.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -16,6 +17,8 @@ pub struct AtOnce {
     pub lights: usize,
     /// Bytes of pictures of one view that are rendered before the first is looked at.
     pub pictures: u64,
+    /// Bytes of traced visibility that are kept from one view to the next.
+    pub visibility: u64,
     /// Whether the photographs are all decoded at the start on as many threads as there are, or on one.
     pub decode_in_parallel: bool,
 }
@@ -26,7 +29,8 @@ impl Default for AtOnce {
             photographs: 0,
             buffers: diamond_splat::KEPT_BYTES as u64,
             lights: LIGHTS_TOGETHER,
-            pictures: PICTURE_BYTES,
+            pictures: PICTURE_BYTES as u64,
+            visibility: VISIBILITY_BYTES,
             decode_in_parallel: true,
         }
     }
@@ -40,17 +44,19 @@ impl AtOnce {
 
     /// As little as possible.
     pub fn least() -> Self {
-        Self { photographs: 0, buffers: 0, lights: 1, pictures: 0, decode_in_parallel: false }
+        Self { photographs: 0, buffers: 0, lights: 1, pictures: 0, visibility: 0, decode_in_parallel: false }
     }
 
     /// Pictures of so many pixels that are rendered before the first is looked at, at least one.
     pub fn pictures_together(&self, pixels: u64) -> usize {
-        // A picture and its part of the channels that are blended, four values per pixel.
-        (self.pictures / (16 * pixels).max(1)).clamp(1, 1024) as usize
+        ((self.pictures / (12 * pixels).max(1)) as usize).clamp(1, self.lights.max(1))
     }
 
     /// A renderer that holds no more at once.
     pub fn renderer<'m>(&self, model: &'m Model) -> Renderer<'m> {
-        Renderer::new(model).with_lights_together(self.lights)
+        Renderer::new(model)
+            .with_lights_together(self.lights)
+            .with_picture_bytes(self.pictures as usize)
+            .with_kept_visibility(self.visibility as usize)
     }
 }

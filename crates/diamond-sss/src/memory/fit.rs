@@ -73,6 +73,7 @@ impl Run<'_> {
             let next = [
                 AtOnce { pictures: fewer(at_once.pictures), ..at_once.clone() },
                 AtOnce { lights: (at_once.lights / 2).max(1), ..at_once.clone() },
+                AtOnce { visibility: fewer(at_once.visibility), ..at_once.clone() },
                 AtOnce { decode_in_parallel: false, ..at_once.clone() },
                 AtOnce { buffers: fewer(at_once.buffers), ..at_once.clone() },
             ];
@@ -87,6 +88,9 @@ impl Run<'_> {
                 }
                 if next.lights < at_once.lights {
                     further.lights = 1;
+                }
+                if next.visibility < at_once.visibility {
+                    further.visibility = 0;
                 }
                 self.peak(&further, gaussians) < peak
             };
@@ -178,11 +182,14 @@ fn differences(whole: &AtOnce, at_once: &AtOnce, facts: &CaptureFacts) -> Vec<St
         out.push(format!("the rasteriser keeps {} of buffers between pictures", size(at_once.buffers)));
     }
     if at_once.lights < whole.lights {
-        out.push(format!("{} of {} lights of a held-out view are blended together", at_once.lights, whole.lights));
+        out.push(format!("{} of {} lights go through a held-out view together", at_once.lights, whole.lights));
     }
     if at_once.pictures < whole.pictures {
         let together = at_once.pictures_together(facts.pixels());
         out.push(format!("{together} pictures of a held-out view are rendered before they are compared"));
+    }
+    if at_once.visibility < whole.visibility {
+        out.push(format!("{} of visibility are kept for the next held-out view", size(at_once.visibility)));
     }
     if whole.decode_in_parallel && !at_once.decode_in_parallel {
         out.push("photographs are checked one after the other".into());

@@ -30,11 +30,11 @@ pub fn light_control(model: &Model, at_once: &AtOnce, camera: &Camera, rig: &[Ol
         *camera
     };
     let mut lights = Vec::new();
-    render_lights(&at_once.renderer(model), at_once, &camera, &chosen, |i, picture| {
+    render_lights(&at_once.renderer(model), &camera, &chosen, |i, picture| {
         let d = camera.pose.rotation * light_direction(&chosen[i], centre);
         lights.push(json!({
             "direction": [d.x, -d.y, -d.z],
-            "picture": data_uri(&encode_png_linear(&picture)?),
+            "picture": data_uri(&encode_png_linear(picture)?),
         }));
         Ok(())
     })?;

@@ -142,7 +142,7 @@ fn comparisons(
     let renderer = at_once.renderer(model);
     for (view, shots) in spread(views) {
         let lights: Vec<_> = shots.iter().map(|s| s.light).collect();
-        render_lights(&renderer, at_once, &view.camera, &lights, |i, radiance| {
+        render_lights(&renderer, &view.camera, &lights, |i, radiance| {
             let shot = shots[i];
             let observation = capture.observation(shot)?;
             let (width, height) = (shot.width as usize, shot.height as usize);
@@ -150,7 +150,7 @@ fn comparisons(
                 Image::from_vec(width, height, 3, bytes.iter().map(|b| f32::from(*b) / 255.0).collect())
                     .map_err(|e| SssError::Internal(e.to_string()))
             };
-            let render = diamond_dataset::to_display(&radiance);
+            let render = diamond_dataset::to_display(radiance);
             let (a, b) = (image(&observation.display)?, image(&render)?);
             let flip = flip_ldr(&a, &b, FlipOptions::default())?;
             let psnr = diamond_metrics::psnr(&a, &b, 1.0)?.min(crate::PSNR_CAP);
@@ -164,7 +164,7 @@ fn comparisons(
             out += &format!(
                 "<div class=\"row\">{}{}{}<p><b>{}</b><br>{seen}<br>{psnr:.2} dB<br>FLIP {:.4}</p></div>",
                 picture(encode_png_rgb(&observation.display, width, height)?, "photograph"),
-                picture(encode_png_linear(&radiance)?, "render"),
+                picture(encode_png_linear(radiance)?, "render"),
                 picture(encode_png_rgb(&heat_bytes(&flip.map, 1.0), width, height)?, "FLIP"),
                 escape(&shot.name),
                 flip.mean
