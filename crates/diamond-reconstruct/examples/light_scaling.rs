@@ -5,8 +5,8 @@
 //! median of the former and the least of the latter, which other programs on the machine lengthen.
 use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_dataset::{Capture, OpenOptions};
-use diamond_light::OlatLight;
 use diamond_image::Image;
+use diamond_light::OlatLight;
 use diamond_reconstruct::{Config, Model, ReconstructError, Reconstruction, Renderer};
 use glam::Vec3;
 use std::path::Path;

@@ -368,7 +368,9 @@ impl<'m> Renderer<'m> {
             let kept = self.kept();
             match kept.get(&key(light)) {
                 Some(found) => Some(Arc::clone(found)),
-                None if !room(&kept) => return self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible),
+                None if !room(&kept) => {
+                    return self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible);
+                }
                 None => None,
             }
         };

@@ -331,7 +331,9 @@ mod tests {
             gaussians.push(mean, scale, rotation, uniform());
         }
         // One behind others that let nothing through.
-        for (mean, scale) in [(Vec3::new(-1.2, 0.0, 5.0), 0.3); 4].into_iter().chain([(Vec3::new(-1.92, 0.0, 8.0), 0.02)]) {
+        for (mean, scale) in
+            [(Vec3::new(-1.2, 0.0, 5.0), 0.3); 4].into_iter().chain([(Vec3::new(-1.92, 0.0, 8.0), 0.02)])
+        {
             gaussians.push(mean, Vec3::splat(scale), Quat::IDENTITY, 0.99);
         }
         let camera = Camera { intrinsics: Intrinsics::from_fov_x(0.9, 139, 71), pose: Pose::IDENTITY };

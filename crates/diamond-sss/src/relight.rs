@@ -17,11 +17,7 @@ pub fn render_lights(
 }
 
 /// The sum of the renders under each light: light is linear. Linear RGB over black.
-pub(crate) fn render_sum(
-    renderer: &Renderer<'_>,
-    camera: &Camera,
-    lights: &[OlatLight],
-) -> Result<Image, SssError> {
+pub(crate) fn render_sum(renderer: &Renderer<'_>, camera: &Camera, lights: &[OlatLight]) -> Result<Image, SssError> {
     let mut sum = Image::new(camera.intrinsics.width as usize, camera.intrinsics.height as usize, 3);
     render_lights(renderer, camera, lights, |_, picture| {
         sum.data_mut().iter_mut().zip(picture.data()).for_each(|(s, v)| *s += v);

@@ -75,9 +75,7 @@ pub fn render_folder(
         if mixes.iter().all(|m| m.lights.len() == 1) {
             // One projection serves all lights of the view.
             let lights: Vec<OlatLight> = mixes.iter().map(|m| m.lights[0]).collect();
-            render_lights(&renderer, &camera, &lights, |i, picture| {
-                store(picture, &name, &mixes[i].name)
-            })?;
+            render_lights(&renderer, &camera, &lights, |i, picture| store(picture, &name, &mixes[i].name))?;
         } else {
             for mix in &mixes {
                 store(&render_sum(&renderer, &camera, &mix.lights)?, &name, &mix.name)?;

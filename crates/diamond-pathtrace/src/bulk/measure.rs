@@ -60,8 +60,7 @@ pub fn reference_pairs(
     cameras: &[Camera],
     options: &ReferenceOptions,
 ) -> Result<Vec<ReferencePair>, PathtraceError> {
-    let half =
-        |seed: u64| ReferenceOptions { samples: (options.samples / 2).max(2), seed, ..*options };
+    let half = |seed: u64| ReferenceOptions { samples: (options.samples / 2).max(2), seed, ..*options };
     let pair = |(i, camera): (usize, &Camera)| {
         let seed = options.seed.wrapping_add(2 * i as u64);
         Ok([
