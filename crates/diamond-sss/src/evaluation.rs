@@ -156,7 +156,7 @@ pub(crate) fn evaluate_with(
             let fitted = match HeldOutGain::of(model) {
                 HeldOutGain::Mean => {
                     let per_channel = model.config.exposure.per_channel;
-                    let gain = fitted_gain(&picture, &observation.radiance, observation.mask.as_ref(), per_channel)
+                    let gain = fitted_gain(picture, &observation.radiance, observation.mask.as_ref(), per_channel)
                         .map(|g| g.unwrap_or(1.0));
                     let mut exposed = picture.clone();
                     for pixel in exposed.data_mut().chunks_exact_mut(3) {
