@@ -29,7 +29,38 @@ struct Taps {
     moves_y: f32,
 }
 
+/// One of the four pixels that a bilinear sample is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tap {
+    /// Index of the pixel, row · width + column.
+    pub index: usize,
+    /// Its share of the sample, in [0, 1]; the four add up to 1.
+    pub weight: f32,
+    /// Derivative of the share along x, 1/pixel; the four add up to 0, and are 0 where the sample is clamped at the border.
+    pub d_x: f32,
+    /// The same along y.
+    pub d_y: f32,
+}
+
 impl Image {
+    /// The pixels of [`Image::sample`] with their shares, for samples of something other than the stored values: the sample
+    /// is Σ weight · value. At the border a pixel may occur twice. `None` for an image without pixels.
+    /// `[eq:bilinear]`
+    pub fn bilinear_taps(&self, x: f32, y: f32) -> Option<[Tap; 4]> {
+        let t = self.taps(x, y)?;
+        let tap = |x: usize, y: usize, right: bool, below: bool| {
+            let (wx, sx) = if right { (t.fx, t.moves_x) } else { (1.0 - t.fx, -t.moves_x) };
+            let (wy, sy) = if below { (t.fy, t.moves_y) } else { (1.0 - t.fy, -t.moves_y) };
+            Tap { index: y * self.width() + x, weight: wx * wy, d_x: sx * wy, d_y: wx * sy }
+        };
+        Some([
+            tap(t.x0, t.y0, false, false),
+            tap(t.x1, t.y0, true, false),
+            tap(t.x0, t.y1, false, true),
+            tap(t.x1, t.y1, true, true),
+        ])
+    }
+
     /// `None` for an image without pixels. NaN coordinates count as 0.
     fn taps(&self, x: f32, y: f32) -> Option<Taps> {
         if self.pixels() == 0 {
@@ -147,6 +178,17 @@ mod tests {
             let expected = vjp(oracle, &at, &wide(d));
             let error = relative_l2(&got, &expected, 1e-2);
             prop_assert!(error <= 1e-4, "{error:e}");
+            let taps = image.bilinear_taps(x, y).unwrap();
+            for k in 0..c {
+                let sum = |share: fn(&Tap) -> f32| -> f64 {
+                    taps.iter().map(|t| f64::from(share(t)) * f64::from(image.data()[t.index * c + k])).sum()
+                };
+                prop_assert!((sum(|t| t.weight) - f64::from(out[k])).abs() <= 1e-6);
+                let alone: Vec<f32> = (0..c).map(|i| f32::from(u8::from(i == k))).collect();
+                let (d_x, d_y) = image.sample_pull(x, y, &alone, &mut Image::new(w, h, c));
+                prop_assert!((sum(|t| t.d_x) - f64::from(d_x)).abs() <= 1e-5);
+                prop_assert!((sum(|t| t.d_y) - f64::from(d_y)).abs() <= 1e-5);
+            }
             let tangent: Vec<f64> = wide(&seed)[..at.len()].to_vec();
             prop_assert!(adjoint_gap(&wide(d), &jvp(oracle, &at, &tangent), &got, &tangent) <= 1e-4);
         }

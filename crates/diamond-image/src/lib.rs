@@ -21,6 +21,7 @@ mod remap;
 mod resize;
 mod transfer;
 
+pub use bilinear::Tap;
 pub use image::{Image, ImageError};
 pub use luminance::{REC709_LUMINANCE, luminance, luminance_pull};
 pub use mask::Mask;

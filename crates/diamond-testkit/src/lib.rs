@@ -3,6 +3,7 @@
 //! Invariant: depends on no crate of ours, so an oracle can never share a mistake with what it judges.
 pub mod adjoint;
 pub mod camera;
+pub mod consistency;
 pub mod deferred;
 pub mod ggx;
 pub mod image;
