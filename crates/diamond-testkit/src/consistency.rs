@@ -118,14 +118,16 @@ pub fn pixel<R: Real>(from: &View<R>, to: &View<R>, i: usize, s: &Settings) -> (
     let [x, y, z] = project(to.pinhole, to.rotation, to.translation, world);
     let [w, h] = to.size;
     for (v, n) in [(x.value(), w), (y.value(), h)] {
-        margin = margin.min(v.abs()).min((v - n as f64).abs());
+        margin = margin.min((v - 0.499).abs()).min((v - (n as f64 - 0.499)).abs());
         // Pixel centres, where the slope jumps.
         let u = v - 0.5;
         if u > -1.0 && u < n as f64 {
             margin = margin.min((u - u.round()).abs());
         }
     }
-    if !(0.0..=w as f64).contains(&x.value()) || !(0.0..=h as f64).contains(&y.value()) {
+    // Between the outermost pixel centres, a thousandth of a pixel more.
+    let inside = |v: f64, n: usize| v >= 0.499 && v <= n as f64 - 0.499;
+    if !inside(x.value(), w) || !inside(y.value(), h) {
         return (None, None, margin);
     }
     let found = bilinear(&to.silhouette, w, h, 1, x, y)[0];
@@ -209,7 +211,7 @@ mod tests {
             min_silhouette: 0.5,
             max_gap: 0.5,
         };
-        // One pixel to the left: column 0 leaves the picture, its right half included.
+        // One pixel to the left: column 0 leaves the picture.
         let all: Vec<u32> = (0..16).collect();
         let ([silhouette, depth], counts) = pair(&view(0.0, 2.0), &view(-0.5, 1.5), &all, &s);
         assert_eq!((silhouette, depth, counts), (0.0, 0.25, [12, 12]));

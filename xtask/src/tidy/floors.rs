@@ -97,6 +97,7 @@ pub const PACKAGES: &[Package] = &[
     },
     Package { name: "diamond-metrics", floor: 1, outside: Some(&["libm"]), optional: &["rayon"], alone: Some(SIMD) },
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2", "libm"]),
+    light("diamond-consistency", 2, &["glam", "libm"]),
     Package { name: "diamond-losses", floor: 2, outside: Some(&["libm"]), optional: &[], alone: Some(SIMD) },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
