@@ -6,7 +6,7 @@ use crate::peak_memory::PeakAfter;
 use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
 use crate::{AtOnce, Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
-use diamond_dataset::{Capture, Selection};
+use diamond_dataset::{Capture, Selection, SelectionManifest};
 use diamond_reconstruct::{
     ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
     StepReport,
@@ -40,6 +40,8 @@ pub struct ReconstructOptions {
     pub views: Selection,
     /// Training lights.
     pub lights: Selection,
+    /// A [`SelectionManifest`] that says which images are learned from and held out, before `views` and `lights`.
+    pub selection: Option<PathBuf>,
     /// Points (PLY) or splats (any format) to start from, in place of the capture's.
     pub initial: Option<PathBuf>,
     /// Continue from the checkpoint.
@@ -64,6 +66,7 @@ impl ReconstructOptions {
             memory_limit: None,
             views: Selection::All,
             lights: Selection::All,
+            selection: None,
             initial: None,
             resume: false,
             force: false,
@@ -145,7 +148,7 @@ struct Costs {
 const COSTS_FILE: &str = "costs.json";
 
 /// Files and folders that a run writes; `--force` removes these and nothing else.
-const RESULTS: [&str; 15] = [
+const RESULTS: [&str; 16] = [
     "model.ply",
     "config.toml",
     "scene.toml",
@@ -158,6 +161,7 @@ const RESULTS: [&str; 15] = [
     "profile.json",
     "run.json",
     "needs.json",
+    "selection.json",
     "checkpoint/state.safetensors",
     "checkpoint/costs.json",
     "images",
@@ -232,7 +236,11 @@ fn run(
     whole.notes.iter().for_each(|note| events(Event::Note(note.clone())));
     // Before anything is decoded: from here on a file whose content changes is refused when it is read.
     let capture_hash = whole.hash()?;
-    let mut capture = whole.select(&options.views, &options.lights)?;
+    let chosen = match &options.selection {
+        Some(path) => whole.with_manifest(&SelectionManifest::read(path)?)?,
+        None => whole.clone(),
+    };
+    let mut capture = chosen.select(&options.views, &options.lights)?;
     if let Some(path) = &options.initial {
         capture.points = Some(path.clone());
     }
@@ -279,6 +287,8 @@ fn run(
     let mut record = record_of(options, &config, &capture, capture_hash.clone());
     record.instruction_set = instruction_set.to_string();
     record.write(folder)?;
+    let selection = capture.manifest(&format!("views {}, lights {}", options.views, options.lights), 0)?;
+    write_json(&folder.join("selection.json"), &selection)?;
     events(Event::Note(format!("first Gaussians: {}", training.initial_origin)));
     let plan = match limited {
         Some(plan) => plan,

@@ -1,6 +1,6 @@
 //! The words of the command line.
 use clap::{Args, Parser, Subcommand};
-use diamond_dataset::Selection;
+use diamond_dataset::{Regime, Selection};
 use diamond_reconstruct::{ByteSize, InstructionChoice};
 use diamond_splat_files::{SplatFormat, WriteOptions};
 use diamond_sss::ExportOptions;
@@ -199,6 +199,8 @@ fn splat_format(text: &str) -> Result<SplatFormat, String> {
 #[command(after_help = "Examples:
   diamond reconstruct capture -o out
   diamond reconstruct capture -o out --views 3 --lights 3 --steps 3000
+  diamond reconstruct capture -o out --regime v3-l3
+  diamond reconstruct capture -o other --preset sss-3dgs --selection out/selection.json
   diamond reconstruct capture -o out --preset mine.toml --seed 7
   diamond reconstruct capture -o out --initial splats.ply
   diamond reconstruct capture -o out --memory-limit 2GiB
@@ -228,12 +230,18 @@ pub struct ReconstructArguments {
     /// number of Gaussians, which is said [default: the configuration, else no limit]
     #[arg(long, value_name = "SIZE")]
     pub memory_limit: Option<ByteSize>,
-    /// Training views: a count, or indices such as 0,5,7 or 0-7
+    /// Training views: a count, a share such as 5%, or indices such as 0,5,7 or 0-7
     #[arg(long, default_value = "all")]
     pub views: Selection,
-    /// Training lights: a count, or indices such as 0,5,7 or 0-7
+    /// Training lights: a count, a share such as 5%, so many per view such as 1/view, or indices such as 0,5,7 or 0-7
     #[arg(long, default_value = "all")]
     pub lights: Selection,
+    /// Views and lights by the name of a regime: full-full, full-one, v5-l5, v3-l3, v5-full, v3-full, v10-l3, 3x4…
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["views", "lights", "selection"])]
+    pub regime: Option<Regime>,
+    /// The images that a selection.json of an earlier run names, to learn from and held out
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["views", "lights"])]
+    pub selection: Option<PathBuf>,
     /// Start from this point cloud (.ply) or these splats (.ply, .splat, .spz, .glb) instead of the capture's
     #[arg(long)]
     pub initial: Option<PathBuf>,

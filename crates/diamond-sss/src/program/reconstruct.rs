@@ -21,6 +21,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         tracing::warn!("Ctrl-C will not write a checkpoint: {e}");
     }
     super::signals::terminate_interrupts(&interrupted);
+    let (views, lights) = a.regime.map_or((a.views, a.lights), |regime| (regime.views, regime.lights));
     let options = ReconstructOptions {
         capture: a.capture,
         output: a.output,
@@ -30,8 +31,9 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         threads: a.threads.map(usize::from),
         instruction_set: a.instruction_set,
         memory_limit: a.memory_limit,
-        views: a.views,
-        lights: a.lights,
+        views,
+        lights,
+        selection: a.selection,
         initial: a.initial,
         resume: a.resume,
         force: a.force,
