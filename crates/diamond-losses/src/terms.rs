@@ -1,6 +1,6 @@
 //! The names of the objective's terms, said once, for configuration, logs and documents.
 
-/// A term of the single-view objective.
+/// A term of the objective.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Term {
     /// Absolute difference and structural dissimilarity of the rendered image, [`crate::photometric`].
@@ -33,6 +33,10 @@ pub enum Term {
     Flatness,
     /// Normals against shortest axes, [`crate::normal_alignment`].
     NormalAlignment,
+    /// Silhouettes of different views against each other; computed elsewhere, listed here for its name.
+    SilhouetteConsistency,
+    /// Depths of different views against each other; computed elsewhere, listed here for its name.
+    DepthConsistency,
 }
 
 /// What is to be known of a term.
@@ -65,7 +69,7 @@ const fn info(
 
 /// All terms, in the order of [`Term`]. A name that the literature gives twice is one term: `enh` and `base_color` are
 /// enhancement, `ray` is visibility.
-pub const TERMS: [TermInfo; 15] = [
+pub const TERMS: [TermInfo; 17] = [
     info(Term::Photometric, "photometric", "ssim", Some("photometric"), [Some(0.2), Some(0.492)]),
     info(Term::Lpips, "lpips", "lpips", None, [Some(0.2), Some(0.171)]),
     info(Term::Mask, "mask", "mask", Some("mask-bce"), [Some(0.1), Some(0.1)]),
@@ -93,6 +97,8 @@ pub const TERMS: [TermInfo; 15] = [
     info(Term::MaskEntropy, "mask_entropy", "mask_entropy", Some("mask-entropy"), [None, None]),
     info(Term::Flatness, "flatness", "flatness", Some("flatness"), [None, None]),
     info(Term::NormalAlignment, "normal_alignment", "normal_alignment", Some("normal-alignment"), [None, None]),
+    info(Term::SilhouetteConsistency, "silhouette_consistency", "silhouette_consistency", None, [None, Some(0.5)]),
+    info(Term::DepthConsistency, "depth_consistency", "depth_consistency", None, [None, Some(0.3)]),
 ];
 
 impl Term {

@@ -55,6 +55,9 @@ pub struct Config {
     pub visibility: Visibility,
     /// Weights of the objective.
     pub loss: Loss,
+    /// Agreement of views about shape.
+    #[serde(default)]
+    pub consistency: Consistency,
     /// Density control.
     pub density: Density,
 }
@@ -501,6 +504,107 @@ pub struct Loss {
     pub visibility: f32,
     /// LPIPS (0 without weights).
     pub lpips: f32,
+    /// Silhouettes of different views against each other; how, says `[consistency]`.
+    #[serde(default)]
+    pub silhouette_consistency: f32,
+    /// Depths of different views against each other.
+    #[serde(default)]
+    pub depth_consistency: f32,
+}
+
+/// What a difference of silhouettes costs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SettingPenalty {
+    /// Binary cross-entropy.
+    #[default]
+    Bce,
+    /// Absolute difference.
+    L1,
+}
+
+/// Which kind of depth is compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SettingDepthKind {
+    /// View-space z.
+    #[default]
+    Z,
+    /// Euclidean distance from the camera.
+    Distance,
+}
+
+/// Which of the two views is a constant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SettingDetach {
+    /// Neither.
+    #[default]
+    None,
+    /// The view of the photograph, from which points are taken.
+    Source,
+    /// The other view, in which they are looked up.
+    Target,
+}
+
+/// What another view's silhouette is compared with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ConsistencyLabel {
+    /// The rendered silhouette of the photograph's view.
+    #[default]
+    Rendered,
+    /// The photograph's mask where it has one.
+    Mask,
+}
+
+/// Agreement of views about shape: which views are compared, when, and how. The weights are in `[loss]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Consistency {
+    /// Fraction of the run from which views are compared, but not before the first round of density control…
+    pub from: f32,
+    /// …and until which.
+    pub until: f32,
+    /// At every so manyth step, with so many times the weight.
+    pub every_steps: u64,
+    /// Each view is compared with one of so many nearest by angle, drawn anew each time.
+    pub neighbours: usize,
+    /// At most so many pixels per pair of views.
+    pub pixels: usize,
+    /// Size of the other view's picture over that of its photograph, in (0, 1].
+    pub target_scale: f32,
+    /// What a difference of silhouettes costs.
+    pub penalty: SettingPenalty,
+    /// Which kind of depth is compared.
+    pub depth: SettingDepthKind,
+    /// What another view's silhouette is compared with.
+    pub label: ConsistencyLabel,
+    /// Which of the two views is a constant.
+    pub detach: SettingDetach,
+    /// A pixel shows the object where the opacity is above this, in [0, 1).
+    pub min_opacity: f32,
+    /// A point is hidden where depths differ by this share or more.
+    pub max_gap: f32,
+}
+
+impl Default for Consistency {
+    fn default() -> Self {
+        Self {
+            from: 0.0,
+            until: 1.0,
+            every_steps: 4,
+            neighbours: 2,
+            pixels: 4096,
+            target_scale: 0.5,
+            penalty: SettingPenalty::default(),
+            depth: SettingDepthKind::default(),
+            label: ConsistencyLabel::default(),
+            detach: SettingDetach::default(),
+            min_opacity: 0.5,
+            max_gap: 0.05,
+        }
+    }
 }
 
 /// How Gaussians are added, removed and moved.
@@ -688,6 +792,11 @@ impl Config {
             ("density.split_divisor", self.density.split_divisor),
             ("density.max_gaussians", self.density.max_gaussians as f32),
             ("visibility.every_steps", self.visibility.every_steps as f32),
+            ("consistency.every_steps", self.consistency.every_steps as f32),
+            ("consistency.neighbours", self.consistency.neighbours as f32),
+            ("consistency.pixels", self.consistency.pixels as f32),
+            ("consistency.target_scale", self.consistency.target_scale),
+            ("consistency.max_gap", self.consistency.max_gap),
         ];
         for (key, value) in positive {
             if value.is_nan() || value <= 0.0 {
@@ -720,6 +829,10 @@ impl Config {
             ("rates.mean_decay", self.rates.mean_decay),
             ("visibility.moved", self.visibility.moved),
             ("loss.ssim", self.loss.ssim),
+            ("consistency.from", self.consistency.from),
+            ("consistency.until", self.consistency.until),
+            ("consistency.target_scale", self.consistency.target_scale),
+            ("consistency.min_opacity", self.consistency.min_opacity),
         ];
         for (key, value) in unit {
             if !(0.0..=1.0).contains(&value) {
@@ -731,6 +844,9 @@ impl Config {
                 "`initial.opacity` must lie strictly between 0 and 1, found {}",
                 self.initial.opacity
             ));
+        }
+        if self.consistency.min_opacity >= 1.0 {
+            return fail("`consistency.min_opacity` must lie below 1: nothing is more opaque".into());
         }
         if self.residual.transfer_degree > 3 {
             let found = self.residual.transfer_degree;
@@ -765,6 +881,8 @@ impl Config {
             ("incident", self.loss.incident),
             ("visibility", self.loss.visibility),
             ("lpips", self.loss.lpips),
+            ("silhouette_consistency", self.loss.silhouette_consistency),
+            ("depth_consistency", self.loss.depth_consistency),
         ];
         let r = &self.rates;
         let rates = [

@@ -1,6 +1,7 @@
 //! The CPU engine: one training step, written out in order.
 //!
 //! scatter → project → visibility → residual → rasterize → shade → objective → the same stairs back → Adam.
+use crate::agreement::Comparison;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
@@ -212,6 +213,12 @@ impl Engine for CpuEngine {
                 content: pair.content,
                 settings: &settings,
                 needs: &needs,
+                comparison: pair.neighbour.map(|neighbour| Comparison {
+                    neighbour,
+                    mask: pair.mask,
+                    factor: plan.consistency,
+                    share,
+                }),
             };
             let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
             let gain = self.model.exposure.index(self.model.config.exposure.mode, pair.view, pair.image);
@@ -234,6 +241,8 @@ impl Engine for CpuEngine {
                 psnr += outcome.psnr * share;
                 gains.extend(gain.zip(outcome.log_gain));
             }
+            pulled.agreement.iter().for_each(|term| self.counters.add(term.name, 1));
+            terms.add(&pulled.agreement, share);
             visible = pulled.visible;
             let t = Instant::now();
             if plan.collect_density {

@@ -8,6 +8,15 @@ use diamond_light::OlatLight;
 use diamond_shading::ShadedMaps;
 use std::path::Path;
 
+/// Another view that a photograph's view may be compared with.
+#[derive(Debug, Clone, Copy)]
+pub struct Neighbour<'a> {
+    /// Where it is seen from.
+    pub camera: &'a Camera,
+    /// Decides at which pixels they are compared.
+    pub seed: u64,
+}
+
 /// One photograph to learn from.
 #[derive(Debug, Clone, Copy)]
 pub struct TrainingPair<'a> {
@@ -27,6 +36,8 @@ pub struct TrainingPair<'a> {
     pub view: usize,
     /// Index of the photograph among all training photographs.
     pub image: usize,
+    /// Another training view for geometric consistency; `None` where there is none or this step compares nothing.
+    pub neighbour: Option<Neighbour<'a>>,
 }
 
 /// What one training step did.

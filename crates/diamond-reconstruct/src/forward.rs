@@ -1,7 +1,9 @@
 //! From raw parameters to a picture under one light, and the way back: the stages between the parameters and the
 //! objective, in the order in which they run.
+use crate::agreement::{self, Comparison};
 use crate::cpu::Profile;
 use crate::needs::StepNeeds;
+use crate::objective::TermValue;
 use crate::region::{NEIGHBOUR_REACH, Region, SSIM_REACH};
 use crate::rows::{
     LightRows, Rows, Transported, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
@@ -131,6 +133,8 @@ pub struct PairGrad {
     pub radii: Vec<f32>,
     /// Gaussians that could contribute.
     pub visible: usize,
+    /// Terms that compare this view with another one, not yet multiplied by the share.
+    pub agreement: Vec<TermValue>,
 }
 
 /// What one pair's forward and backward pass works on.
@@ -151,6 +155,8 @@ pub struct Pass<'a> {
     pub settings: &'a Settings,
     /// What is computed.
     pub needs: &'a StepNeeds,
+    /// Another view that this one is compared with.
+    pub comparison: Option<Comparison<'a>>,
 }
 
 /// Where the time of a pass goes, and how much work it is.
@@ -236,6 +242,13 @@ pub fn value_and_grad(
     let (shaded, shade_pullback) = shade(&gbuffer, &part, light, &settings.shading).map_err(error::stage("shade"))?;
     let t = profile.add("shade forward", t);
 
+    let agreement = match &pass.comparison {
+        Some(c) if needs.silhouette_consistency || needs.depth_consistency => {
+            Some(agreement::agree(model, activated, camera, &raster, c, needs, profile, counters)?)
+        }
+        _ => None,
+    };
+    let t = if agreement.is_some() { Instant::now() } else { t };
     let grad = objective(&View { shaded: &shaded, opacity: &opacity, camera: &part, region })?;
     let t = profile.add("objective", t);
 
@@ -243,16 +256,24 @@ pub fn value_and_grad(
     if let Some(d_opacity) = grad.opacity {
         d.opacity.data_mut().iter_mut().zip(d_opacity.data()).for_each(|(a, b)| *a += b);
     }
-    let d = RasterGrad {
+    let mut d = RasterGrad {
         features: layout.pack(&d.features, &region, width, height),
         opacity: region.paste(&d.opacity, width, height),
         depth: region.paste(&d.depth, width, height),
     };
+    if let Some(agreement) = &agreement {
+        for (to, from) in [(&mut d.opacity, &agreement.d_opacity), (&mut d.depth, &agreement.d_depth)] {
+            to.data_mut().iter_mut().zip(from.data()).for_each(|(a, b)| *a += b);
+        }
+    }
     let t = profile.add("shade backward", t);
     let pulled = raster_pullback.pull(&d).map_err(error::stage("rasterize.pull"))?;
     let t = profile.add("rasterize backward", t);
 
     let mut out = ActivatedGrad { gaussians: pulled.gaussians, ..zero_materials(n) };
+    if let Some(agreement) = &agreement {
+        out.gaussians.add_assign(&agreement.gaussians).map_err(error::stage("consistency"))?;
+    }
     let count = layout.count();
     let mut d_residual = vec![0.0; 3 * rows.len()];
     let mut d_incident = vec![0.0; rows.len()];
@@ -357,6 +378,7 @@ pub fn value_and_grad(
         screen: pulled.screen,
         radii: projection.radii().to_vec(),
         visible: rows.len(),
+        agreement: agreement.map_or_else(Vec::new, |a| a.terms),
     })
 }
 

@@ -15,6 +15,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 pub mod adam;
+mod agreement;
 mod byte_size;
 mod channel_layout;
 mod config;
@@ -48,7 +49,7 @@ pub use channel_layout::ChannelLayout;
 pub use config::*;
 pub use counters::Counters;
 pub use cpu::{CpuEngine, Profile};
-pub use engine::{Engine, Rendering, StepReport, TrainingPair};
+pub use engine::{Engine, Neighbour, Rendering, StepReport, TrainingPair};
 pub use error::{ReconstructError, io_advice};
 pub use exposure::{Exposure, ExposureFile, NamedGain, fitted_gain};
 pub use facts::CaptureFacts;

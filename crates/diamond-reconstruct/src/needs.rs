@@ -119,6 +119,10 @@ needs! {
     transfer_smoothness: Term, "one pass over the transfer vectors";
     /// LPIPS.
     lpips: Term, "a deep network's two passes";
+    /// Silhouettes of different views against each other.
+    silhouette_consistency: Term, "with depth_consistency a second view's opacity and depth, forward and backward";
+    /// Depths of different views against each other.
+    depth_consistency: Term, "with silhouette_consistency a second view's opacity and depth, forward and backward";
     /// Roughness.
     roughness_channel: Channel, "1 of 14 channels, forward and backward";
     /// Metalness.
@@ -194,6 +198,10 @@ impl Needs {
             "" => Decision::new(false, "nothing reads the visibility of a light"),
             read => Decision::new(true, read),
         };
+        let one_view = "one training view: there is none that it could be compared with";
+        let ever_compared = (0..config.steps).any(|s| StepPlan::new(config, s).consistency > 0.0);
+        let never_compared =
+            "no step of the run is in consistency.from to until after the first round of density control";
         let moved = config.visibility.moved;
         let density = match config.density.strategy {
             DensityStrategy::Adaptive => Decision::new(true, "density.strategy = \"adaptive\""),
@@ -228,6 +236,12 @@ impl Needs {
                     false => "loss.lpips = 0, and this program has no LPIPS weights",
                 },
             ),
+            silhouette_consistency: Decision::weight("loss.silhouette_consistency", loss.silhouette_consistency)
+                .only_if(facts.views != 1, one_view)
+                .only_if(ever_compared, never_compared),
+            depth_consistency: Decision::weight("loss.depth_consistency", loss.depth_consistency)
+                .only_if(facts.views != 1, one_view)
+                .only_if(ever_compared, never_compared),
             roughness_channel: Decision::new(
                 shading.roughness_unfreeze < 1.0,
                 match shading.roughness_unfreeze {
@@ -323,6 +337,8 @@ impl Needs {
             own_psnr: self.own_psnr.needed,
             visibility: self.traced_visibility.needed || self.fitted_visibility.needed,
             window: self.dssim.needed,
+            silhouette_consistency: self.silhouette_consistency.needed && plan.consistency > 0.0,
+            depth_consistency: self.depth_consistency.needed && plan.consistency > 0.0,
         }
     }
 
@@ -453,6 +469,10 @@ pub struct StepNeeds {
     pub own_psnr: bool,
     /// The visibility of the light.
     pub visibility: bool,
+    /// Silhouettes of different views against each other, at this step.
+    pub silhouette_consistency: bool,
+    /// Depths of different views against each other, at this step.
+    pub depth_consistency: bool,
 }
 
 impl fmt::Display for Needs {

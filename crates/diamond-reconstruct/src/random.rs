@@ -22,6 +22,8 @@ pub enum Purpose {
     Relocation = 6,
     /// Noise on the means.
     Noise = 7,
+    /// Which other view a view is compared with, and at which pixels.
+    Consistency = 8,
 }
 
 /// A seeded stream of random numbers.

@@ -1,14 +1,16 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
 use crate::exposure;
 use crate::pairs::PairOrder;
+use crate::random::{Purpose, Random};
 use crate::region::Region;
 use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
 use crate::{
-    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Model, Needs, ReconstructError, Rendering, Scene,
-    StepPlan, StepReport, TrainingPair,
+    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Model, Needs, Neighbour, ReconstructError,
+    Rendering, Scene, StepPlan, StepReport, TrainingPair,
 };
 use diamond_camera::Camera;
+use diamond_consistency::nearest_views;
 use diamond_dataset::{Capture, Observation};
 use diamond_light::OlatLight;
 use std::collections::BTreeMap;
@@ -26,6 +28,8 @@ pub struct Reconstruction {
     /// What of each pair's photograph and mask is not empty, once it was looked at.
     contents: Vec<Option<Option<Region>>>,
     order: PairOrder,
+    /// Of each training view the nearest others, where views are compared.
+    neighbours: Vec<Vec<usize>>,
     step: u64,
     /// Where the first Gaussians came from, for the log.
     pub initial_origin: String,
@@ -75,6 +79,13 @@ impl Reconstruction {
         let order = PairOrder::new(config.seed, pairs.len());
         let facts = CaptureFacts::of(&capture)?;
         let needs = needs.unwrap_or_else(|| Needs::decide(config, &facts));
+        let neighbours = match needs.silhouette_consistency.needed || needs.depth_consistency.needed {
+            true => {
+                let cameras: Vec<Camera> = capture.train.iter().map(|v| v.camera).collect();
+                nearest_views(&cameras, model.scene.centre(), config.consistency.neighbours)
+            }
+            false => Vec::new(),
+        };
         Ok(Self {
             capture,
             config: config.clone(),
@@ -84,6 +95,7 @@ impl Reconstruction {
             contents: vec![None; pairs.len()],
             pairs,
             order,
+            neighbours,
             step: 0,
             initial_origin: points.origin.clone(),
         })
@@ -223,7 +235,14 @@ impl Reconstruction {
             let observation = self.capture.observation(&self.capture.train[v].shots[s])?;
             let look = || Region::of_photograph(&observation.radiance, observation.mask.as_ref());
             let content = *self.contents[pair].get_or_insert_with(look);
-            loaded.push(Loaded { view: v, shot: s, image: pair, content, observation });
+            let neighbour = match self.neighbours.get(v) {
+                Some(others) if plan.consistency > 0.0 && !others.is_empty() => {
+                    let mut random = Random::new(self.config.seed, Purpose::Consistency, self.step * batch + k);
+                    Some((others[random.below(others.len())], random.below(usize::MAX) as u64))
+                }
+                _ => None,
+            };
+            loaded.push(Loaded { view: v, shot: s, image: pair, content, observation, neighbour });
         }
         let pairs: Vec<TrainingPair<'_>> = loaded
             .iter()
@@ -239,6 +258,9 @@ impl Reconstruction {
                     content: loaded.content,
                     view: loaded.view,
                     image: loaded.image,
+                    neighbour: loaded
+                        .neighbour
+                        .map(|(other, seed)| Neighbour { camera: &self.capture.train[other].camera, seed }),
                 }
             })
             .collect();
@@ -258,6 +280,8 @@ struct Loaded {
     /// The part of it that is not empty.
     content: Option<Region>,
     observation: Arc<Observation>,
+    /// Another view, and a seed.
+    neighbour: Option<(usize, u64)>,
 }
 
 /// The images that a run learns from, as text.

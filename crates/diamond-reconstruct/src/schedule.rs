@@ -26,6 +26,8 @@ pub struct StepPlan {
     pub prune_large: bool,
     /// Whether opacities are reset after this step.
     pub reset_opacity: bool,
+    /// Factor on the weights of geometric consistency: as many steps as this one stands for, 0 where it stands for none.
+    pub consistency: f32,
 }
 
 /// Geometric interpolation from `a` to `b`; linear where one of them is 0.
@@ -64,6 +66,12 @@ impl StepPlan {
             };
         let adaptive = active && d.strategy == DensityStrategy::Adaptive;
         let reset = at(d.reset_every);
+        let c = &config.consistency;
+        let first_round = match d.strategy {
+            DensityStrategy::None => 0,
+            _ => (from / d.every_steps + 1) * d.every_steps,
+        };
+        let comparing = done > at(c.from).max(first_round) && done <= at(c.until) && done.is_multiple_of(c.every_steps);
         Self {
             mean_rate: log_lerp(r.mean, r.mean_final, mean_progress),
             attribute_factor: log_lerp(1.0, r.attribute_final, fraction),
@@ -78,6 +86,7 @@ impl StepPlan {
             densify: active && done > from && done.is_multiple_of(d.every_steps),
             grow: !frozen,
             prune_large: fraction >= d.large_from,
+            consistency: if comparing { c.every_steps as f32 } else { 0.0 },
             reset_opacity: adaptive && reset > 0 && done.is_multiple_of(reset) && done < until,
         }
     }
@@ -131,6 +140,22 @@ mod tests {
         assert!(moves > 0 && grows == 0 && resets == 0);
         config.density.strategy = DensityStrategy::None;
         assert_eq!(rounds(&config, 0), [0, 0, 0]);
+    }
+
+    #[test]
+    fn views_are_compared_after_the_first_round_and_with_the_weight_of_all_steps() {
+        let mut config = Config::preset("resolved").unwrap();
+        config.steps = 1000;
+        (config.consistency.every_steps, config.consistency.until) = (5, 0.9);
+        let factors = |c: &Config| (0..1000).map(|s| StepPlan::new(c, s).consistency).collect::<Vec<f32>>();
+        let first_round = (0..1000u16).find(|&s| StepPlan::new(&config, s.into()).densify).unwrap().into();
+        let (all, first_round): (_, usize) = (factors(&config), first_round);
+        assert!(all[..=first_round].iter().all(|f| *f == 0.0) && all[900..].iter().all(|f| *f == 0.0));
+        assert_eq!(all.iter().sum::<f32>(), (900 - first_round - 1) as f32);
+        config.density.strategy = DensityStrategy::None;
+        assert_eq!(factors(&config).iter().sum::<f32>(), 900.0);
+        config.consistency.from = 0.5;
+        assert_eq!(factors(&config).iter().sum::<f32>(), 400.0);
     }
 
     #[test]

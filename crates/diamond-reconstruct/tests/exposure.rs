@@ -48,6 +48,7 @@ fn train(model: Model, capture: &Capture, gains: &[f32]) -> Model {
             content: Region::of_photograph(&scaled[image], observations[image].mask.as_ref()),
             view,
             image,
+            neighbour: None,
         };
         engine.training_step(step, &StepPlan::new(&config, step), &[pair]).expect("a step");
     }

@@ -128,6 +128,9 @@ fn schedule(config: &Config) -> Vec<Milestone> {
     add(steps_where(config, |p| p.collect_density), &|_| "density statistics".into());
     add(steps_where(config, |p| p.densify), &|n| format!("{n} rounds of density control"));
     add(steps_where(config, |p| p.reset_opacity), &|n| format!("{n} resets of opacity"));
+    if config.loss.silhouette_consistency > 0.0 || config.loss.depth_consistency > 0.0 {
+        add(steps_where(config, |p| p.consistency > 0.0), &|n| format!("{n} comparisons of views"));
+    }
     let decay = (f64::from(config.rates.mean_decay) * config.steps as f64).round() as u64;
     add(Some((1, decay.max(1), 0)), &|_| "learning rate of the means falls".into());
     out.sort_by_key(|m| (m.from, m.until));
