@@ -60,11 +60,14 @@ pub struct ConsistencyOptions {
     pub max_gap: f32,
     /// Whose maps are constants.
     pub detach: Detach,
+    /// Whether the silhouette term pulls on the first view's silhouette as the label as well. With cross-entropy that pull is
+    /// ln((1 − o)/o) even where both agree: it presses every silhouette above the threshold toward 1.
+    pub label_gradient: bool,
 }
 
 impl ConsistencyOptions {
     /// The defaults for a scene in this range: cross-entropy, view-space z read in 1/z, silhouettes above ½, gaps below
-    /// 5 %, nothing detached.
+    /// 5 %, the gradient to everything.
     pub fn new(range: DepthRange) -> Self {
         Self {
             penalty: SilhouettePenalty::default(),
@@ -74,6 +77,7 @@ impl ConsistencyOptions {
             min_silhouette: 0.5,
             max_gap: 0.05,
             detach: Detach::default(),
+            label_gradient: true,
         }
     }
 

@@ -147,7 +147,7 @@ impl PairPullback<'_> {
                         grad.to.silhouette.data_mut()[tap.index] += d_found * tap.weight;
                     }
                 }
-                if of_from && from.mask.is_none() {
+                if of_from && options.label_gradient && from.mask.is_none() {
                     grad.from.silhouette.data_mut()[pixel] += bounded((d_label * d_silhouette) as f32);
                 }
             }

@@ -58,7 +58,8 @@ fn depth_of(camera: &Camera, radius: f32, noise: &[f32]) -> Vec<f32> {
 }
 
 fn options() -> impl Strategy<Value = ConsistencyOptions> {
-    (any::<[bool; 4]>(), 0usize..4).prop_map(|([l1, distance, linear, wide], _)| ConsistencyOptions {
+    any::<[bool; 5]>().prop_map(|[l1, distance, linear, wide, label_gradient]| ConsistencyOptions {
+        label_gradient,
         penalty: if l1 { SilhouettePenalty::L1 } else { SilhouettePenalty::Bce },
         depth_kind: if distance { DepthKind::Distance } else { DepthKind::Z },
         sampling: if linear { DepthSampling::Linear } else { DepthSampling::Inverse },
@@ -118,6 +119,7 @@ impl Case {
             far: f64::from(o.range.far),
             min_silhouette: f64::from(o.min_silhouette),
             max_gap: f64::from(o.max_gap),
+            label_gradient: o.label_gradient,
         }
     }
 

@@ -551,8 +551,10 @@ pub enum SettingDetach {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ConsistencyLabel {
-    /// The rendered silhouette of the photograph's view.
+    /// The rendered silhouette of the photograph's view, as a constant.
     #[default]
+    Constant,
+    /// The rendered silhouette of the photograph's view, which is pulled on as well.
     Rendered,
     /// The photograph's mask where it has one.
     Mask,

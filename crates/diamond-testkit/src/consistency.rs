@@ -43,6 +43,8 @@ pub struct Settings {
     pub min_silhouette: f64,
     /// Relative gap from which a point is hidden.
     pub max_gap: f64,
+    /// Whether the label has a derivative.
+    pub label_gradient: bool,
 }
 
 /// Cost of a silhouette value where the label is `m`.
@@ -103,7 +105,9 @@ impl<R: Real> View<R> {
 /// Silhouette cost and depth cost of one pixel, where they count, and how far the nearest decision or kink is: a change of
 /// inputs that moves things by less (in pixels, shares, silhouette) changes neither.
 pub fn pixel<R: Real>(from: &View<R>, to: &View<R>, i: usize, s: &Settings) -> (Option<R>, Option<R>, f64) {
-    let label = from.mask.as_ref().map_or(from.silhouette[i], |m| R::of(m[i]));
+    let own = from.silhouette[i];
+    let own = if s.label_gradient { own } else { R::of(own.value()) };
+    let label = from.mask.as_ref().map_or(own, |m| R::of(m[i]));
     let mut margin = (from.silhouette[i].value() - s.min_silhouette).abs();
     margin = margin.min((label.value() - s.min_silhouette).abs());
     if !from.shows(i, s) || !from.known(i) {
@@ -210,6 +214,7 @@ mod tests {
             far: 3.0,
             min_silhouette: 0.5,
             max_gap: 0.5,
+            label_gradient: true,
         };
         // One pixel to the left: column 0 leaves the picture.
         let all: Vec<u32> = (0..16).collect();

@@ -193,9 +193,13 @@ pub fn moments(
         ("activations and gradients", n * (80.0 + 80.0 + 4.0 * (row_values + 16.0) + 4.0 * values)),
     ];
     let pictures = ("pictures of a step", images + shaded);
+    // Where views are compared: a projection of the other one, its reverse, its share of the gradient, and maps of both.
+    let scale = f64::from(config.consistency.target_scale).powi(2);
+    let other = projection + n * slots * 4.0 * (8.0 + stride(0.0)) + n * 52.0 + pixels * (24.0 + 40.0 * scale);
+    let other = ("the other view", of(needs.silhouette_consistency.needed || needs.depth_consistency.needed, other));
     let largest = [&backward_of_rasteriser[..], &backward_of_residual[..], &adam[..]]
         .into_iter()
-        .map(|now| [&common[..], &[pictures], now].concat())
+        .map(|now| [&common[..], &[pictures, other], now].concat())
         .map(|parts| Moment::new("steps", &parts))
         .max_by_key(Moment::bytes);
     let transient =
