@@ -551,13 +551,13 @@ pub enum SettingDetach {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ConsistencyLabel {
-    /// The rendered silhouette of the photograph's view, as a constant.
+    /// The photograph's mask where it has one, else as `constant`.
     #[default]
+    Mask,
+    /// The rendered silhouette of the photograph's view, as a constant.
     Constant,
     /// The rendered silhouette of the photograph's view, which is pulled on as well.
     Rendered,
-    /// The photograph's mask where it has one.
-    Mask,
 }
 
 /// Agreement of views about shape: which views are compared, when, and how. The weights are in `[loss]`.
