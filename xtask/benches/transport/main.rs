@@ -1,8 +1,10 @@
 //! `cargo xtask bench transport`: what an error costs, in processor seconds of one thread.
 //!
 //! Rays per second; variance × time of the reference on the scenes of `assets/fixtures/transport/mitsuba`, beside Mitsuba where
-//! `--mitsuba PYTHON` names an interpreter that has it (its rounds run between ours); the same for a rig of 112 lights; and run time against
-//! error for the settings of the bulk renderer and for the reference (see [`sweep`]), as CSV and as a picture.
+//! `--mitsuba PYTHON` names an interpreter that has it (its rounds run between ours); the same for a rig of 112 lights, along one
+//! path and in bulk (see [`bulk`]); and run time against error for the settings of the bulk renderer and for the reference (see [`sweep`]), as
+//! CSV and as a picture.
+mod bulk;
 mod plot;
 mod sweep;
 
@@ -41,7 +43,7 @@ struct Arguments {
     /// Rounds before and as many after Mitsuba's.
     #[arg(long, default_value_t = 4)]
     rounds: u64,
-    /// Only one of: rays, error, rig, sweep.
+    /// Only one of: rays, error, rig, bulk, sweep.
     #[arg(long)]
     only: Option<String>,
     /// Folder of the tables.
@@ -83,16 +85,19 @@ fn run(arguments: &Arguments) -> Result<(), String> {
     if wanted("rays") {
         rays(&folder)?.write(&arguments.out)?;
     }
-    if wanted("error") || wanted("rig") {
+    if wanted("error") || wanted("rig") || wanted("bulk") {
         let text = std::fs::read_to_string(folder.join("refs.json")).map_err(|e| e.to_string())?;
         let json: Value = serde_json::from_str(&text).map_err(|e| e.to_string())?;
-        let mut scenes = Vec::new();
+        let (mut scenes, mut rigs) = (Vec::new(), Vec::new());
         for (name, entry) in json.as_object().ok_or("refs.json: expected scenes")? {
             let (scene, camera) = read_scene(&folder, entry)?;
             let fov = 2.0 * (0.5 * camera.intrinsics.width as f32 / camera.intrinsics.fx).atan();
             let camera = Camera { intrinsics: Intrinsics::from_fov_x(fov, SIDE, SIDE), ..camera };
             if wanted("rig") && (name == "sphere_null_front" || name == "mesh_null_front") {
                 scenes.push((format!("{name}/rig"), rig(&scene)?, camera, 16.min(arguments.samples)));
+            }
+            if wanted("bulk") && (name == "sphere_null_front" || name == "mesh_null_front") {
+                rigs.push((format!("{name}/rig"), rig(&scene)?, camera));
             }
             if wanted("error") {
                 scenes.push((name.clone(), scene, camera, arguments.samples));
@@ -123,6 +128,9 @@ fn run(arguments: &Arguments) -> Result<(), String> {
             (None, None) => Vec::new(),
         };
         half(&mut ours, arguments.rounds)?;
+        for (name, scene, camera) in &rigs {
+            bulk::run(name, scene, camera, &theirs)?.write(&arguments.out)?;
+        }
         let columns = [
             "scene",
             "µs per path",
@@ -155,7 +163,9 @@ fn run(arguments: &Arguments) -> Result<(), String> {
                 table.push(row);
             }
         }
-        table.write(&arguments.out)?;
+        if !scenes.is_empty() {
+            table.write(&arguments.out)?;
+        }
     }
     if wanted("sweep") {
         sweep::run(&arguments.out, arguments.plots.as_deref())?;
