@@ -113,6 +113,15 @@ fn main() -> Result<(), Failure> {
         show("", n, one, of(&model, n)?);
     }
     show(" kept", 112, kept(&model, 1)?, kept(&model, 112)?);
+    // What a light costs from the second view on.
+    let known = |n: usize| {
+        let renderer = Renderer::new(&model).with_kept_visibility(usize::MAX);
+        let render = || Ok(renderer.each_radiance(&camera, &lights[..n], |_, _| Ok::<(), ReconstructError>(()))?);
+        render().and_then(|()| time(render))
+    };
+    let one = known(1)?;
+    show(" known", 1, one, one);
+    show(" known", 112, one, known(112)?);
     let mut untraced = model.clone();
     untraced.config.visibility.traced = false;
     let one = of(&untraced, 1)?;

@@ -3,7 +3,7 @@
 //! With n the surface normal, v the direction to the viewer, l the direction to the light and h = (v+l)/|v+l| halfway
 //! between them, an isotropic microfacet BRDF depends on n·l, n·v, v·h and the angle between n and h only. For a
 //! smooth surface the last one must be known to a small fraction of a small angle: 1 − (n·h)² has lost it in `f32`, so
-//! it is kept as sin² = |n×h|², and the few operations up to here run in `f64`.
+//! it is kept as sin² = |n×h|² = |n×(v+l)|²/|v+l|². Both squares come from `f64`, and are divided after they are rounded.
 use crate::number::{Number, PerLane};
 use crate::vector::Vector;
 use glam::{DVec3, Vec3};
@@ -80,18 +80,16 @@ fn half_vector(v: DVec3, l: DVec3) -> (DVec3, f64) {
     (sum * inverse, inverse)
 }
 
-/// n, v, l → the four angles.
-struct Values;
+/// n, v, l → n·l, n·v, v·(v+l), |v+l|², |n×(v+l)|²: sums of products, without a root or a quotient.
+struct Products;
 
-impl PerLane<9, 4> for Values {
+impl PerLane<9, 5> for Products {
     #[inline(always)]
-    fn at(&self, x: [f32; 9]) -> [f32; 4] {
+    fn at(&self, x: [f32; 9]) -> [f32; 5] {
         let (n, v, l) = (widen(x[0], x[1], x[2]), widen(x[3], x[4], x[5]), widen(x[6], x[7], x[8]));
-        let (h, inverse) = half_vector(v, l);
-        let cross = n.cross(h);
-        let sin2 = cross.dot(cross);
-        let sin2 = if sin2 < 1.0 && inverse > 0.0 { sin2 } else { 1.0 };
-        [n.dot(l) as f32, n.dot(v) as f32, v.dot(h) as f32, sin2 as f32]
+        let sum = v + l;
+        let cross = n.cross(sum);
+        [n.dot(l) as f32, n.dot(v) as f32, v.dot(sum) as f32, sum.dot(sum) as f32, cross.dot(cross) as f32]
     }
 }
 
@@ -125,7 +123,11 @@ impl<T: Number> AnglesOf<T> {
     #[inline(always)]
     pub fn new(n: Vector<T>, v: Vector<T>, l: Vector<T>) -> Self {
         let x = [n.x, n.y, n.z, v.x, v.y, v.z, l.x, l.y, l.z];
-        let [cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h] = T::per_lane(&Values, x);
+        let [cos_theta_i, cos_theta_o, along, square, across] = T::per_lane(&Products, x);
+        let exists = square.reaches((MIN_HALF_LENGTH * MIN_HALF_LENGTH) as f32);
+        let square = square.or_where_not(exists, square.same(1.0));
+        let cos_theta_d = (along / square.root()).only_where(exists);
+        let sin2_theta_h = (across / square).at_most(1.0).or_where_not(exists, square.same(1.0));
         Self { cos_theta_i, cos_theta_o, cos_theta_d, sin2_theta_h }
     }
 

@@ -247,11 +247,11 @@ fn blend<S: Simd, const N: usize>(s: S, k: BlendChannels<'_>) {
     let (many, rest) = k.out.as_chunks_mut::<GATHERED>();
     let mut first = 0;
     for out in many {
-        k.gathered.clear();
-        for row in rows {
-            let mut values = [0.0; GATHERED];
-            values.copy_from_slice(&k.features[*row as usize * channels + first..][..GATHERED]);
-            k.gathered.push(values);
+        if k.gathered.len() < rows.len() {
+            k.gathered.resize(rows.len(), [0.0; GATHERED]);
+        }
+        for (row, to) in rows.iter().zip(k.gathered.iter_mut()) {
+            to.copy_from_slice(&k.features[*row as usize * channels + first..][..GATHERED]);
         }
         for (g, out) in out.as_chunks_mut::<TOGETHER>().0.iter_mut().enumerate() {
             let mut sums: [Block<S, N>; TOGETHER] = [[s.splat_f32s(0.0); N]; TOGETHER];
