@@ -48,6 +48,18 @@ fn peak(image: &Image, coverage: &Image) -> f64 {
     values.get(at.min(values.len().saturating_sub(1))).map_or(0.0, |v| f64::from(*v)).max(1e-30)
 }
 
+/// Whether there is a reference for each camera.
+fn checked(cameras: &[Camera], references: &[ReferencePair]) -> Result<(), PathtraceError> {
+    if cameras.len() == references.len() && !cameras.is_empty() {
+        return Ok(());
+    }
+    Err(PathtraceError::Shape {
+        what: "references of a measurement",
+        expected: format!("{}, one for each camera, and at least one", cameras.len()),
+        found: format!("{}", references.len()),
+    })
+}
+
 /// Two independent references of a view, each with half the paths.
 pub type ReferencePair = [crate::ReferenceImage; 2];
 
@@ -93,17 +105,25 @@ impl BulkError {
         references: &[ReferencePair],
         progress: &(dyn Fn(f32) + Sync),
     ) -> Result<Self, PathtraceError> {
-        if cameras.len() != references.len() || cameras.is_empty() {
-            return Err(PathtraceError::Shape {
-                what: "references of a measurement",
-                expected: format!("{}, one for each camera, and at least one", cameras.len()),
-                found: format!("{}", references.len()),
-            });
-        }
+        checked(cameras, references)?;
         let halved = |seed: u64| BulkOptions { walks: (options.walks / 2).max(1), seed, ..*options };
         let whole = Bulk::solve(scene, options, &|f| progress(f * 0.5))?;
         let first = Bulk::solve(scene, &halved(options.seed.wrapping_add(1)), &|f| progress(0.5 + f * 0.25))?;
         let second = Bulk::solve(scene, &halved(options.seed.wrapping_add(2)), &|f| progress(0.75 + f * 0.25))?;
+        Self::between(&whole, [&first, &second], cameras, references)
+    }
+
+    /// The same for solutions that are at hand: the whole, and two independent ones with half its walks.
+    ///
+    /// # Errors
+    /// Other numbers of references than of cameras; cameras inside the object.
+    pub fn between(
+        whole: &Bulk<'_>,
+        [first, second]: [&Bulk<'_>; 2],
+        cameras: &[Camera],
+        references: &[ReferencePair],
+    ) -> Result<Self, PathtraceError> {
+        checked(cameras, references)?;
         let (mut sum, mut reference_sum, mut reference_square) = (0.0f64, 0.0f64, 0.0f64);
         let (mut squares, mut noise, mut relative, mut n) = (0.0f64, 0.0f64, 0.0f64, 0usize);
         // Of a pixel's squared differences, all lamps and channels together.
