@@ -114,7 +114,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         let mut recipe = Recipe::parse_changed(&std::fs::read_to_string(file)?, file, &changes)?;
         recipe.quality.measured_paths = paths.parse()?;
         let object = Object::new(&recipe, Path::new(file).parent().unwrap_or(Path::new("")))?;
-        let m = Measurement::new(&recipe, &object, &Plan::new(&recipe)?);
+        let mut m = Measurement::new(&recipe, &object, &Plan::new(&recipe)?);
+        if let Ok(v) = std::env::var("CONN") {
+            m.bulk.connections = v.parse()?;
+        }
+        let plan = Plan::new(&recipe)?;
         let start = Instant::now();
         let mut last = processor_seconds(start);
         let mut lap = || {
@@ -143,6 +147,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             let (walks, seed) = ((m.bulk.walks / 2).max(1), m.bulk.seed.wrapping_add(seed));
             Bulk::solve(&m.scene, &BulkOptions { walks, seed, ..m.bulk }, &|_| ())
         };
+        if std::env::var("ONLY").is_ok() {
+            println!("{solve} {rendered}");
+        }
         let halves = [half(1)?, half(2)?];
         let e = BulkError::between(&bulk, [&halves[0], &halves[1]], &m.cameras, &references)?;
         println!(
@@ -158,6 +165,16 @@ fn main() -> Result<(), Box<dyn Error>> {
             100.0 * e.noise,
             e.noise_db,
         );
+        if std::env::var("WHOLE").is_ok() {
+            let falloff = diamond_light::Falloff::InverseSquare { reference: recipe.rig.light_distance };
+            let mut scene = m.scene.clone();
+            scene.lights = plan.lights.iter().map(|l| diamond_pathtrace::Light::Olat { light: *l, falloff }).collect();
+            lap();
+            let bulk = Bulk::solve(&scene, &m.bulk, &|_| ())?;
+            let solve = lap();
+            bulk.render(&m.cameras[0], 0)?;
+            println!("   whole rig {}: solve {solve:.1} view {:.2}", scene.lights.len(), lap());
+        }
         if let Some(folder) = &folder {
             std::fs::create_dir_all(folder)?;
             std::fs::write(folder.join(&stem).with_extension("ppm"), picture(&references[0], &view.lights))?;

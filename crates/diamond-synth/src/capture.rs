@@ -101,7 +101,7 @@ pub fn synthesize(
         let Some(&first) = missing.first() else { continue };
         let scene = lit(recipe, &job.object, &job.plan, lights);
         let split = job.plan.views[first].split;
-        let seed = recipe.seed ^ if split == Split::Test { HELD_OUT } else { 0 };
+        let seed = split_seed(recipe, split);
         let options = bulk_options(recipe, seed.wrapping_add((g as u64) << 32));
         let stage = Stage::Solve(g + 1, groups.len());
         let bulk = Bulk::solve(&scene, &options, &|f| progress(stage, f))?;
@@ -254,6 +254,11 @@ impl Job<'_> {
     }
 }
 
+/// The seed of a split's images.
+fn split_seed(recipe: &Recipe, split: Split) -> u64 {
+    recipe.seed ^ if split == Split::Test { HELD_OUT } else { 0 }
+}
+
 fn split_name(view: &PlannedView) -> &'static str {
     if view.split == Split::Train { "train" } else { "test" }
 }
@@ -271,4 +276,51 @@ fn resized(camera: &Camera, side: u32) -> Camera {
     (intrinsics.cx, intrinsics.cy) = (k.cx * scale, k.cy * scale);
     (intrinsics.width, intrinsics.height) = (side.min(k.width), side.min(k.height));
     Camera { intrinsics, pose: camera.pose }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_image::Image;
+
+    /// Over many recipe seeds, what a training solution and a held-out one are off by in the same picture has no correlation; of two pictures from
+    /// one solution it has, so the measure would notice.
+    #[test]
+    fn held_out_images_have_noise_of_their_own() {
+        let text = r#"
+            name = "noise"
+            object = { kind = "solids", cells = 16, parts = [{ solid = "sphere", centre = [0, 0, 0], radius = 0.8 }] }
+            material = { sigma_t = [6, 8, 12], albedo = [0.98, 0.9, 0.7] }
+            rig = { views = 2, lights = 2 }
+            film = { resolution = 12 }
+            quality = { points = 120, walks = 16, samples_per_axis = 2 }
+        "#;
+        let base = Recipe::parse(text, "noise").unwrap();
+        let (object, plan) = (Object::new(&base, Path::new("")).unwrap(), Plan::new(&base).unwrap());
+        let scene = lit(&base, &object, &plan, &[0, 1]);
+        let camera = plan.views[0].camera;
+        let all = |view: BulkView| -> Vec<f32> { view.lights.iter().flat_map(Image::data).copied().collect() };
+        let rounds = 12;
+        // Training, held out, and training once more with the same solution.
+        let mut pictures: [Vec<Vec<f32>>; 3] = Default::default();
+        for seed in 0..rounds {
+            let recipe = Recipe { seed, ..base.clone() };
+            let [train, test] = [Split::Train, Split::Test].map(|split| split_seed(&recipe, split));
+            let solve = |seed| Bulk::solve(&scene, &bulk_options(&recipe, seed), &|_| ()).unwrap();
+            let (a, b) = (solve(train), solve(test));
+            pictures[0].push(all(a.render(&camera, train).unwrap()));
+            pictures[1].push(all(b.render(&camera, test).unwrap()));
+            pictures[2].push(all(a.render(&camera, train ^ 5).unwrap()));
+        }
+        let deviations = pictures.map(|list| {
+            let mean = |i: usize| list.iter().map(|p| p[i]).sum::<f32>() / rounds as f32;
+            let means: Vec<f32> = (0..list[0].len()).map(mean).collect();
+            list.iter().flat_map(|p| p.iter().zip(&means).map(|(v, m)| f64::from(v - m))).collect::<Vec<f64>>()
+        });
+        let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let correlation = |a: &[f64], b: &[f64]| product(a, b) / (product(a, a) * product(b, b)).sqrt();
+        let [train, test, again] = &deviations;
+        assert!(correlation(train, again) > 0.8, "{}", correlation(train, again));
+        assert!(correlation(train, test).abs() < 0.15, "{}", correlation(train, test));
+    }
 }

@@ -13,7 +13,7 @@ fn shipped_recipes_make_closed_objects() {
         if path.ends_with("training-family.toml") {
             let family = Family::parse(&text, &origin).unwrap();
             assert!(family.count >= 100);
-            for member in family.members().take(8) {
+            for member in family.members().take(12) {
                 let object = Object::new(&member, &folder).unwrap();
                 assert!(object.mesh.is_closed(), "{}", member.name);
             }

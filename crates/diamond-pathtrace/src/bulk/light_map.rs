@@ -14,22 +14,33 @@ use rayon::prelude::*;
 #[derive(Debug)]
 pub(crate) struct LightMaps<'a> {
     geometry: &'a Geometry,
-    maps: Vec<Option<LightMap>>,
+    /// What each light's map is a map of; `None` where its rays are traced.
+    views: Vec<Option<LightView>>,
+    side: usize,
+    /// For each light, for each texel, the start of its triangles, and the end of the last's, from the light's `first` on.
+    starts: Vec<u32>,
+    first: Vec<usize>,
+    triangles: Vec<u32>,
     /// Normal and offset of each triangle's plane, relative to `centre`.
     planes: Vec<[f32; 4]>,
     centre: Vec3,
     diameter: f32,
 }
 
-/// What one light sees.
-#[derive(Debug)]
-struct LightMap {
-    view: LightView,
-    side: usize,
-    /// Start of each texel's triangles, and the end of the last's.
-    starts: Vec<u32>,
-    triangles: Vec<u32>,
+/// Ways from one point to all lights. Memory that is kept between points.
+#[derive(Debug, Default)]
+pub(crate) struct Ways {
+    /// How each light shines on the point.
+    pub shines: Vec<Shine>,
+    /// How much of the way to each light lies inside the object, scene units.
+    pub lengths: Vec<f32>,
+    texels: Vec<usize>,
+    spans: Vec<[u32; 2]>,
+    nearest: Vec<[f32; 4]>,
 }
+
+/// No texel.
+const OUTSIDE: usize = usize::MAX;
 
 /// Points → the square [−1, 1]² of a map.
 #[derive(Debug, Clone, Copy)]
@@ -73,7 +84,7 @@ impl<'a> LightMaps<'a> {
         let (low, high) = geometry.bounds();
         let (centre, radius) = (0.5 * (low + high), 0.5 * (high - low).length());
         let mut planes = Vec::new();
-        let mut maps: Vec<Option<LightMap>> = (0..lamps.len()).map(|_| None).collect();
+        let mut maps: Vec<Option<(LightView, Vec<u32>, Vec<u32>)>> = (0..lamps.len()).map(|_| None).collect();
         if let Geometry::Mesh(mesh) = geometry
             && side > 0
         {
@@ -118,46 +129,84 @@ impl<'a> LightMaps<'a> {
                         mesh.each_crossing(centre + origin, direction, |triangle| triangles.push(triangle));
                     }
                     starts.push(triangles.len() as u32);
-                    Some(LightMap { view, side, starts, triangles })
+                    Some((view, starts, triangles))
                 })
                 .collect();
         }
-        Self { geometry, maps, planes, centre, diameter: 2.0 * radius }
-    }
-
-    /// How much of the way from `point`, which lies inside the object, to a light lies inside it, scene units.
-    #[inline]
-    pub fn inside_length(&self, light: usize, point: Vec3, shine: &Shine) -> f32 {
-        let p = point - self.centre;
-        if let Some(map) = &self.maps[light] {
-            let at = (map.view.project(p) * 0.5 + 0.5) * map.side as f32;
-            let (x, y) = (at.x as usize, at.y as usize);
-            if x < map.side && y < map.side {
-                let texel = y * map.side + x;
-                let (first, last) = (map.starts[texel] as usize, map.starts[texel + 1] as usize);
-                let (mut length, mut exits) = (0.0, 0);
-                for &triangle in &map.triangles[first..last] {
-                    let [nx, ny, nz, offset] = self.planes[triangle as usize];
-                    let normal = Vec3::new(nx, ny, nz);
-                    let slope = normal.dot(shine.direction);
-                    let distance = (offset - normal.dot(p)) / slope;
-                    if distance > 0.0 && distance < shine.distance.min(self.diameter) {
-                        let sign = if slope > 0.0 { 1 } else { -1 };
-                        exits += sign;
-                        length += sign as f32 * distance;
-                    }
+        let side = side as usize;
+        let (mut views, mut first) = (Vec::new(), Vec::new());
+        let (mut starts, mut triangles) = (Vec::new(), Vec::new());
+        for map in maps {
+            first.push(triangles.len());
+            views.push(map.as_ref().map(|map| map.0));
+            match map {
+                Some((_, from, list)) => {
+                    starts.extend(from);
+                    triangles.extend(list);
                 }
-                if exits == 1 && length > 0.0 {
-                    return length;
-                }
+                // Never read: it keeps the places of the others.
+                None if !planes.is_empty() => starts.resize(starts.len() + side * side + 1, 0),
+                None => {}
             }
         }
-        self.geometry.inside_length(point, shine.direction, shine.distance, true, NO_PRIMITIVE)
+        Self { geometry, views, side, starts, first, triangles, planes, centre, diameter: 2.0 * radius }
+    }
+
+    /// How all lights shine on `point`, which lies inside the object, and how much of each way lies inside.
+    ///
+    /// A map is larger than what a processor keeps at hand, so each look-up waits for memory three times. In loops of their
+    /// own the look-ups of all lights wait at the same time.
+    pub fn look_up(&self, lamps: &Lamps, point: Vec3, ways: &mut Ways) {
+        let lights = lamps.len();
+        let p = point - self.centre;
+        ways.shines.clear();
+        ways.shines.extend((0..lights).map(|l| lamps.shine(l, point)));
+        ways.texels.clear();
+        ways.texels.extend(self.views.iter().map(|view| {
+            let Some(view) = view else { return OUTSIDE };
+            let at = (view.project(p) * 0.5 + 0.5) * self.side as f32;
+            let (x, y) = (at.x as usize, at.y as usize);
+            if x < self.side && y < self.side { y * self.side + x } else { OUTSIDE }
+        }));
+        ways.spans.clear();
+        let stride = self.side * self.side + 1;
+        ways.spans.extend(ways.texels.iter().enumerate().map(|(l, texel)| match *texel {
+            OUTSIDE => [0, 0],
+            texel => [self.starts[l * stride + texel], self.starts[l * stride + texel + 1]],
+        }));
+        ways.nearest.clear();
+        ways.nearest.extend(ways.spans.iter().zip(&self.first).map(|([from, to], first)| {
+            if from == to { [0.0; 4] } else { self.planes[self.triangles[first + *from as usize] as usize] }
+        }));
+        ways.lengths.clear();
+        for l in 0..lights {
+            let ([from, to], shine) = (ways.spans[l].map(|i| i as usize), &ways.shines[l]);
+            let (mut length, mut exits) = (0.0, 0);
+            let mut cross = |[nx, ny, nz, offset]: [f32; 4]| {
+                let normal = Vec3::new(nx, ny, nz);
+                let slope = normal.dot(shine.direction);
+                let distance = (offset - normal.dot(p)) / slope;
+                if distance > 0.0 && distance < shine.distance.min(self.diameter) {
+                    let sign = if slope > 0.0 { 1 } else { -1 };
+                    exits += sign;
+                    length += sign as f32 * distance;
+                }
+            };
+            if from < to {
+                cross(ways.nearest[l]);
+                let list = &self.triangles[self.first[l]..][from + 1..to];
+                list.iter().for_each(|triangle| cross(self.planes[*triangle as usize]));
+            }
+            ways.lengths.push(match exits == 1 && length > 0.0 {
+                true => length,
+                false => self.geometry.inside_length(point, shine.direction, shine.distance, true, NO_PRIMITIVE),
+            });
+        }
     }
 
     /// Bytes that the maps hold.
     pub fn bytes(&self) -> usize {
-        self.maps.iter().flatten().map(|map| 4 * (map.starts.len() + map.triangles.len())).sum()
+        4 * (self.starts.len() + self.triangles.len())
     }
 
     /// Mean and largest |error| of look-ups against rays, over random inside points, as a fraction of the object's diameter.
@@ -166,16 +215,17 @@ impl<'a> LightMaps<'a> {
         let mut rng = crate::Rng::new(3, 3);
         let (low, high) = self.geometry.bounds();
         let (mut sum, mut worst, mut n) = (0.0, 0.0f32, 0);
+        let mut ways = Ways::default();
         while n < count {
             let u = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
             let point = low + (high - low) * u;
             if !self.geometry.contains(point) {
                 continue;
             }
-            for l in 0..lamps.len() {
-                let shine = lamps.shine(l, point);
+            self.look_up(lamps, point, &mut ways);
+            for (shine, length) in ways.shines.iter().zip(&ways.lengths) {
                 let exact = self.geometry.inside_length(point, shine.direction, shine.distance, true, NO_PRIMITIVE);
-                let error = (self.inside_length(l, point, &shine) - exact).abs() / self.diameter;
+                let error = (length - exact).abs() / self.diameter;
                 sum += error;
                 worst = worst.max(error);
             }

@@ -10,10 +10,11 @@
 use super::BulkOptions;
 use super::directions::{HEMISPHERE, HEMISPHERE_MEAN, Moments, basis};
 use super::lamps::Lamps;
-use super::light_map::LightMaps;
+use super::light_map::{LightMaps, Ways};
 use super::points::SurfacePoint;
 use crate::geometry::{Facing, NO_PRIMITIVE};
 use crate::medium::{Flight, henyey_greenstein, sample_henyey_greenstein};
+use crate::sobol::Sobol;
 use crate::{Frame, Geometry, Medium, Rng};
 use glam::{Vec2, Vec3};
 use std::f32::consts::TAU;
@@ -49,30 +50,50 @@ pub(crate) fn forced_flight(sigma_t: Vec3, length: f32, channel: usize, u: f32) 
     (distance, weights_at(sigma_t, length, distance))
 }
 
-/// The distance at which the mean distribution of [`forced_flight`] reaches `u`, by bisection: one number instead of two leaves nothing
+/// Steps of [`forced_flight_quantile`] at most; where channels are alike three are enough.
+const STEPS: usize = 24;
+
+/// A step that is shorter, as a fraction of the length, is the last.
+const STEP_ENOUGH: f32 = 1e-6;
+
+/// The distance at which the mean distribution of [`forced_flight`] reaches `u`: one number instead of two leaves nothing
 /// to the choice of a channel. The same weights.
 /// `[eq:forced-flight]`
 pub(crate) fn forced_flight_quantile(sigma_t: Vec3, length: f32, u: f32) -> (f32, Vec3) {
     if sigma_t.x == sigma_t.y && sigma_t.x == sigma_t.z {
         return forced_flight(sigma_t, length, 0, u);
     }
-    let below = |t: f32| {
-        let part = |sigma: f32| match sigma * length > 1e-6 {
-            true => (-sigma * t).exp_m1() / (-sigma * length).exp_m1(),
-            false => t / length,
-        };
-        (part(sigma_t.x) + part(sigma_t.y) + part(sigma_t.z)) / 3.0
-    };
-    let (mut low, mut high) = (0.0, length);
-    for _ in 0..24 {
-        let middle = 0.5 * (low + high);
-        if below(middle) < u {
-            low = middle;
-        } else {
-            high = middle;
-        }
+    // Of each channel: whether it is too thin for its exponential to differ from a line, and 1 − e^(−σs).
+    let scattered = sigma_t.to_array().map(|sigma| -(-sigma * length).exp_m1());
+    let thin = |c: usize| sigma_t[c] * length <= 1e-6;
+    // Where the first channel gets there, the mean is not yet there.
+    let mut distance = f32::INFINITY;
+    for c in 0..3 {
+        let quantile = if thin(c) { u * length } else { -(-u * scattered[c]).ln_1p() / sigma_t[c] };
+        distance = distance.min(quantile);
     }
-    let distance = 0.5 * (low + high);
+    // Newton's steps on a concave function come nearer from the left and never pass.
+    for _ in 0..STEPS {
+        let (mut sum, mut slope) = (0.0, 0.0);
+        for c in 0..3 {
+            let (part, density) = match thin(c) {
+                true => (distance / length, 1.0 / length),
+                false => {
+                    let left = (-sigma_t[c] * distance).exp_m1();
+                    (-left / scattered[c], sigma_t[c] * (1.0 + left) / scattered[c])
+                }
+            };
+            sum += part;
+            slope += density;
+        }
+        let step = (3.0 * u - sum) / slope;
+        // Written so that NaN fails it.
+        if !(step > STEP_ENOUGH * length) {
+            break;
+        }
+        distance += step;
+    }
+    let distance = distance.clamp(0.0, length);
     (distance, weights_at(sigma_t, length, distance))
 }
 
@@ -105,6 +126,7 @@ pub(crate) fn hammersley(i: u32, n: u32, shift: Vec2) -> Vec2 {
 struct Gathered {
     values: Vec<f32>,
     touched: bool,
+    ways: Ways,
 }
 
 impl MatchedWalks<'_> {
@@ -114,12 +136,13 @@ impl MatchedWalks<'_> {
         let width = 3 * lights;
         let mut sums = vec![0.0f32; HEMISPHERE * width];
         let mut moments = Moments::<HEMISPHERE>::new();
-        let mut gathered = Gathered { values: vec![0.0; width], touched: false };
+        let mut gathered = Gathered { values: vec![0.0; width], touched: false, ways: Ways::default() };
         let frame = Frame::new(point.smooth_normal);
         let mut rng = Rng::new(self.options.seed, index as u64);
-        let shift = Vec2::new(rng.uniform(), rng.uniform());
-        for i in 0..self.options.walks {
-            let u = hammersley(i, self.options.walks, shift);
+        let mut numbers = Sobol::new(std::array::from_fn(|_| rng.bits()));
+        for _ in 0..self.options.walks {
+            rng.lead_with(numbers.draw());
+            let u = Vec2::new(rng.uniform(), rng.uniform());
             let radius = u.x.sqrt();
             let (sin, cos) = (TAU * u.y).sin_cos();
             let local = Vec3::new(radius * cos, radius * sin, (1.0 - u.x).max(0.0).sqrt());
@@ -156,7 +179,7 @@ impl MatchedWalks<'_> {
         let (geometry, medium) = (self.geometry, self.medium);
         let leaving = geometry.closest_hit(point.position, direction, f32::INFINITY, Facing::Leaving, point.primitive);
         let Some(end) = leaving else { return false };
-        let channel = if rng.uniform() < 1.0 / 3.0 { 0 } else { 1 + usize::from(rng.uniform() < 0.5) };
+        let channel = ((3.0 * rng.uniform()) as usize).min(2);
         let (distance, weight) = forced_flight(medium.sigma_t, end.distance, channel, rng.uniform());
         let mut throughput = weight * medium.albedo;
         let mut origin = point.position + direction * distance;
@@ -217,13 +240,12 @@ impl MatchedWalks<'_> {
         gathered.touched = true;
         let (red, rest) = gathered.values.split_at_mut(lights);
         let (green, blue) = rest.split_at_mut(lights);
-        for l in 0..lights {
-            let shine = self.lamps.shine(l, origin);
-            let length = self.maps.inside_length(l, origin, &shine);
+        self.maps.look_up(self.lamps, origin, &mut gathered.ways);
+        for (l, (shine, length)) in gathered.ways.shines.iter().zip(&gathered.ways.lengths).enumerate() {
             let value = shine.factor * henyey_greenstein(medium.g, direction, shine.direction);
             let left = match gray {
                 true => Vec3::splat((-medium.sigma_t.x * length).exp()),
-                false => (-medium.sigma_t * length).exp(),
+                false => (-medium.sigma_t * *length).exp(),
             };
             let sent = weight * left * value;
             red[l] += sent.x;

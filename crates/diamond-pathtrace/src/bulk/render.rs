@@ -1,5 +1,6 @@
 //! One view under all lamps: camera rays, stored light, single scattering, reflections.
 use super::directions::{CONE, HEMISPHERE, HEMISPHERE_MEAN, basis, carried};
+use super::light_map::Ways;
 use super::matched::forced_flight_quantile;
 use super::refracting::Cone;
 use super::{Bulk, Stored};
@@ -73,6 +74,7 @@ struct Gather<'a, const N: usize> {
     weights: Vec<(u32, f32)>,
     /// For each channel, each light.
     values: Vec<f32>,
+    ways: Ways,
     rng: Rng,
     sequence: f32,
 }
@@ -135,7 +137,7 @@ impl<'a, const N: usize> Gather<'a, N> {
     fn new(bulk: &'a Bulk<'a>, mut rng: Rng) -> Self {
         let sequence = rng.uniform();
         let values = vec![0.0; 3 * bulk.lamps.len()];
-        Self { bulk, wanted: Vec::new(), weights: Vec::new(), values, rng, sequence }
+        Self { bulk, wanted: Vec::new(), weights: Vec::new(), values, ways: Ways::default(), rng, sequence }
     }
 
     /// The mean over a pixel's square of what `see` adds for each ray that meets the object.
@@ -336,12 +338,13 @@ impl Gather<'_, HEMISPHERE> {
             let (distance, ratio) = forced_flight_quantile(medium.sigma_t, length, self.sequence);
             let at = hit.position + direction * distance;
             let weight = weight * ratio * medium.albedo / PLACES as f32;
-            for l in 0..bulk.lamps.len() {
-                let shine = bulk.lamps.shine(l, at);
-                let inside = bulk.maps.inside_length(l, at, &shine);
+            let mut ways = std::mem::take(&mut self.ways);
+            bulk.maps.look_up(&bulk.lamps, at, &mut ways);
+            for (l, (shine, inside)) in ways.shines.iter().zip(&ways.lengths).enumerate() {
                 let phase = henyey_greenstein(medium.g, direction, shine.direction);
-                self.add(l, weight * medium.transmittance(inside) * (phase * shine.factor));
+                self.add(l, weight * medium.transmittance(*inside) * (phase * shine.factor));
             }
+            self.ways = ways;
         }
     }
 }
