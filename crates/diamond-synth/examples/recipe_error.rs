@@ -1,12 +1,14 @@
 //! The errors of recipes at their own quality against the unbiased reference, as a table, and where in the pictures they are.
 //!
-//!     cargo run --release -p diamond-synth --example recipe_error -- PATHS RECIPE... [KEY=VALUE...] [--pictures DIR] [--keep DIR]
+//!     cargo run --release -p diamond-synth --example recipe_error -- PATHS RECIPE... [KEY=VALUE...] [--pictures DIR] [--keep DIR] [--whole-rig]
 //!
 //! PATHS of the reference per pixel. KEY=VALUE changes all recipes, such as `quality.walks=4096`. `--pictures`: for each recipe reference, bulk, and ten times
 //! their difference (grey is none). `--keep`: references are written there and read again by the next run with the same recipe, resolution and
 //! PATHS; changes to the object, the material or the rig want another folder. With it, `RECIPE.f32` holds all pictures of the first view.
+//! `--whole-rig`: what a solution and a view with all lamps cost.
 use diamond_image::{Image, Transfer};
-use diamond_pathtrace::{Bulk, BulkError, BulkOptions, BulkView, LightImage, ReferenceImage, reference_pairs};
+use diamond_light::Falloff;
+use diamond_pathtrace::{Bulk, BulkError, BulkOptions, BulkView, Light, LightImage, ReferenceImage, reference_pairs};
 use diamond_synth::{Measurement, Object, Plan, Recipe};
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -103,6 +105,8 @@ fn option(arguments: &mut Vec<String>, name: &str) -> Option<PathBuf> {
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
     let (folder, keep) = (option(&mut arguments, "--pictures"), option(&mut arguments, "--keep"));
+    let whole = arguments.iter().any(|a| a == "--whole-rig");
+    arguments.retain(|a| a != "--whole-rig");
     let changes: Vec<String> = arguments.iter().filter(|a| a.contains('=')).cloned().collect();
     arguments.retain(|a| !a.contains('='));
     let (paths, files) = arguments.split_first().ok_or("expected PATHS and recipes")?;
@@ -114,11 +118,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         let mut recipe = Recipe::parse_changed(&std::fs::read_to_string(file)?, file, &changes)?;
         recipe.quality.measured_paths = paths.parse()?;
         let object = Object::new(&recipe, Path::new(file).parent().unwrap_or(Path::new("")))?;
-        let mut m = Measurement::new(&recipe, &object, &Plan::new(&recipe)?);
-        if let Ok(v) = std::env::var("CONN") {
-            m.bulk.connections = v.parse()?;
-        }
         let plan = Plan::new(&recipe)?;
+        let m = Measurement::new(&recipe, &object, &plan);
         let start = Instant::now();
         let mut last = processor_seconds(start);
         let mut lap = || {
@@ -147,9 +148,6 @@ fn main() -> Result<(), Box<dyn Error>> {
             let (walks, seed) = ((m.bulk.walks / 2).max(1), m.bulk.seed.wrapping_add(seed));
             Bulk::solve(&m.scene, &BulkOptions { walks, seed, ..m.bulk }, &|_| ())
         };
-        if std::env::var("ONLY").is_ok() {
-            println!("{solve} {rendered}");
-        }
         let halves = [half(1)?, half(2)?];
         let e = BulkError::between(&bulk, [&halves[0], &halves[1]], &m.cameras, &references)?;
         println!(
@@ -165,15 +163,15 @@ fn main() -> Result<(), Box<dyn Error>> {
             100.0 * e.noise,
             e.noise_db,
         );
-        if std::env::var("WHOLE").is_ok() {
-            let falloff = diamond_light::Falloff::InverseSquare { reference: recipe.rig.light_distance };
+        if whole {
+            let falloff = Falloff::InverseSquare { reference: recipe.rig.light_distance };
             let mut scene = m.scene.clone();
-            scene.lights = plan.lights.iter().map(|l| diamond_pathtrace::Light::Olat { light: *l, falloff }).collect();
+            scene.lights = plan.lights.iter().map(|l| Light::Olat { light: *l, falloff }).collect();
             lap();
             let bulk = Bulk::solve(&scene, &m.bulk, &|_| ())?;
             let solve = lap();
             bulk.render(&m.cameras[0], 0)?;
-            println!("   whole rig {}: solve {solve:.1} view {:.2}", scene.lights.len(), lap());
+            println!("all {} lamps: solve {solve:.1} CPU s, view {:.2} CPU s", scene.lights.len(), lap());
         }
         if let Some(folder) = &folder {
             std::fs::create_dir_all(folder)?;

@@ -94,7 +94,13 @@ pub fn read_scene(folder: &Path, json: &Value) -> Result<(Scene, Camera), String
 
 /// [`check`] with `samples` paths per pixel; `disturb` changes each scene before it is rendered.
 pub fn compare(folder: &Path, samples: u32, disturb: impl Fn(&mut Scene)) -> Result<OracleReport, String> {
-    let file = folder.join("refs.json");
+    // The list itself, the folder that holds it, or a folder that holds one under another name.
+    let listed = folder.join("refs.json");
+    let (folder, file) = match (folder.is_file(), listed.exists()) {
+        (true, _) => (folder.parent().unwrap_or(Path::new("")), folder.to_path_buf()),
+        (false, true) => (folder, listed),
+        (false, false) => (folder, super::only_file(folder, "json").unwrap_or(listed)),
+    };
     let text = std::fs::read_to_string(&file).map_err(|e| format!("{}: {e}; expected the scenes", file.display()))?;
     let json: Value = serde_json::from_str(&text).map_err(|e| format!("{}: {e}", file.display()))?;
     let scenes = json.as_object().ok_or_else(|| format!("{}: expected an object of scenes", file.display()))?;
@@ -181,6 +187,39 @@ mod tests {
         println!("{report}");
         assert_eq!(report.columns.len(), 8);
         assert!(report.passed(), "{report}");
+    }
+
+    /// A list under another name works; missing, truncated and broken files are errors that name the file.
+    #[test]
+    fn renamed_lists_work_and_broken_files_are_named() {
+        let folder = std::env::temp_dir().join(format!("mitsuba-oracle-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&folder);
+        std::fs::create_dir_all(&folder).expect("a folder");
+        assert!(check(&folder).expect_err("empty").contains("refs.json"));
+        let text = std::fs::read_to_string(fixtures().join("refs.json")).expect("the list");
+        let json: Value = serde_json::from_str(&text).expect("json");
+        let all = json.as_object().expect("scenes");
+        let (name, scene) = all.iter().find(|(_, s)| s["boundary"][0] == "null").expect("a scene without boundary");
+        let list = serde_json::json!({ "other": scene });
+        std::fs::write(folder.join("more.json"), list.to_string()).expect("write");
+        let [mean, error] = ["npy", "se.npy"].map(|end| folder.join(format!("other.{end}")));
+        std::fs::copy(fixtures().join(format!("{name}.npy")), &mean).expect("copy");
+        assert!(compare(&folder, 2, |_| {}).expect_err("no errors").contains("other.se.npy"));
+        std::fs::copy(fixtures().join(format!("{name}.se.npy")), &error).expect("copy");
+        assert_eq!(compare(&folder, 2, |_| {}).expect("renamed").columns.len(), 2);
+        assert_eq!(compare(&folder.join("more.json"), 2, |_| {}).expect("by its name").columns.len(), 2);
+        let bytes = std::fs::read(&mean).expect("a picture");
+        for cut in [0, 5, 100, bytes.len() - 7] {
+            std::fs::write(&mean, &bytes[..cut]).expect("write");
+            assert!(compare(&folder, 2, |_| {}).expect_err("cut").contains("other.npy"), "{cut}");
+        }
+        for broken in
+            [&list.to_string()[..60], "[1, 2]", "{\"other\": {}}", "{\"other\": {\"shape\": \"unit sphere\"}}"]
+        {
+            std::fs::write(folder.join("more.json"), broken).expect("write");
+            assert!(compare(&folder, 2, |_| {}).expect_err("broken").contains("more.json"), "{broken}");
+        }
+        std::fs::remove_dir_all(&folder).expect("clean up");
     }
 
     /// A medium that is a quarter denser is noticed, and so is a light that comes from the other side.

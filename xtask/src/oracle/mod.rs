@@ -12,7 +12,7 @@ pub mod picture;
 pub mod splat;
 
 use std::fmt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Which family of reference values a path holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -114,6 +114,14 @@ impl fmt::Display for OracleReport {
             (all, _) => write!(f, "  {failed} of {all} columns out of tolerance: FAIL"),
         }
     }
+}
+
+/// The file of this kind in a folder, if there is one and only one: tables that were renamed.
+fn only_file(folder: &Path, extension: &str) -> Option<PathBuf> {
+    let all = std::fs::read_dir(folder).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let mut those = all.filter(|path| path.extension().is_some_and(|e| e == extension));
+    let first = those.next()?;
+    those.next().is_none().then_some(first)
 }
 
 /// Compares our implementation with the reference at `path`, a file or a folder.

@@ -39,6 +39,9 @@ pub(crate) struct Ways {
     nearest: Vec<[f32; 4]>,
 }
 
+/// What one light sees: starts of texels' triangles with the end of the last's, and the triangles.
+type LightMap = (LightView, Vec<u32>, Vec<u32>);
+
 /// No texel.
 const OUTSIDE: usize = usize::MAX;
 
@@ -84,7 +87,7 @@ impl<'a> LightMaps<'a> {
         let (low, high) = geometry.bounds();
         let (centre, radius) = (0.5 * (low + high), 0.5 * (high - low).length());
         let mut planes = Vec::new();
-        let mut maps: Vec<Option<(LightView, Vec<u32>, Vec<u32>)>> = (0..lamps.len()).map(|_| None).collect();
+        let mut maps: Vec<Option<LightMap>> = (0..lamps.len()).map(|_| None).collect();
         if let Geometry::Mesh(mesh) = geometry
             && side > 0
         {

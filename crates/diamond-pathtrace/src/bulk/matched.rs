@@ -87,8 +87,9 @@ pub(crate) fn forced_flight_quantile(sigma_t: Vec3, length: f32, u: f32) -> (f32
             slope += density;
         }
         let step = (3.0 * u - sum) / slope;
-        // Written so that NaN fails it.
-        if !(step > STEP_ENOUGH * length) {
+        // Of NaN, as of a step that is too short, nothing is taken.
+        let enough = step > STEP_ENOUGH * length;
+        if !enough {
             break;
         }
         distance += step;

@@ -26,8 +26,8 @@ const CLOSED_FORM: f64 = 2e-7;
 pub fn check(path: &Path) -> Result<OracleReport, String> {
     let file = if path.is_dir() {
         let names = ["oracles.csv", "analytic.csv"].map(|name| path.join(name));
-        let found = names.iter().find(|file| file.exists()).cloned();
-        found.ok_or_else(|| format!("{}: expected oracles.csv or analytic.csv in it", path.display()))?
+        let found = names.iter().find(|file| file.exists()).cloned().or_else(|| super::only_file(path, "csv"));
+        found.ok_or_else(|| format!("{}: expected oracles.csv, analytic.csv or one other CSV in it", path.display()))?
     } else {
         path.to_path_buf()
     };
@@ -146,5 +146,47 @@ mod tests {
         let report = compare("planted", "temperature of the moon,250,\n", 1e-2).expect("a table");
         assert!(!report.passed() && report.title.contains("temperature of the moon"));
         assert!(compare("planted", "H(1) at a=1,many,\n", 1e-2).is_err());
+        // Cut off in the middle of a row, before its number; not text; nothing at all.
+        let cut = &fixture()[..fixture().len() - 400];
+        let cut = &cut[..cut.rfind(',').unwrap_or(0).min(cut.rfind('\n').unwrap_or(0) + 6)];
+        assert!(compare("cut", cut, 1.0).is_err(), "{}", &cut[cut.len() - 40..]);
+        assert!(!compare("empty", "", 1e-2).expect("an empty table").passed());
+    }
+
+    /// A table keeps working under another name; a folder without one, or a file that is no text, is an error.
+    #[test]
+    fn renamed_tables_are_found_and_broken_ones_named() {
+        let folder = std::env::temp_dir().join(format!("analytic-oracle-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).expect("a folder");
+        assert!(check(&folder).expect_err("empty").contains("oracles.csv"));
+        std::fs::write(folder.join("more.csv"), "H(1) at a=1,2.9078105291,\n").expect("write");
+        assert!(check(&folder).expect("renamed").passed());
+        assert!(check(&folder.join("more.csv")).expect("by its name").passed());
+        std::fs::write(folder.join("more.csv"), [0xff, 0xfe, 0x00, 0x9c]).expect("write");
+        assert!(check(&folder).expect_err("no text").contains("more.csv"));
+        std::fs::remove_dir_all(&folder).expect("clean up");
+    }
+
+    /// Parameters that the fixture has not: near white, forward and backward, any index, any cosine. What can be known without tracing holds:
+    /// nothing is lost without absorption, nothing is gained with it, and the half-space follows Chandrasekhar's function.
+    #[test]
+    fn other_parameters_of_the_same_kinds_are_traced() {
+        let value = |text: &str| estimate::estimate(&row::read(text).expect(text), 2e-3);
+        for medium in ["a=1.0 g=0.9 tau=4.0", "a=1.0 g=-0.6 tau=2.0 n=1.3", "a=1.0 g=0.95 tau=8.0 eta=1.8"] {
+            for incidence in ["normal", "Lambert", "mu0=0.3"] {
+                let [r, t] = ["R", "T total"].map(|side| value(&format!("slab {medium} {side} {incidence}")));
+                let (sum, error) = (r.mean + t.mean, r.error.hypot(t.error));
+                assert!(error < 4e-3 && (sum - 1.0).abs() < 4.0 * error, "{medium} {incidence}: {sum} ± {error}");
+            }
+        }
+        let absorbing =
+            ["n=1.3", "n=1.5", "n=1.8"].map(|n| value(&format!("semiinf a=0.9 g=0.8 {n} total R normal")).mean);
+        assert!(absorbing.iter().all(|r| *r > 0.02 && *r < 0.5), "{absorbing:?}");
+        for (a, mu) in [(0.7, 0.35), (0.97, 0.8), (0.999, 0.15)] {
+            let found = value(&format!("semiinf_iso a={a} plane albedo, mu0={mu}"));
+            let h = diamond_pathtrace::closed_form::chandrasekhar_h(a, &[mu])[0];
+            let expected = 1.0 - h * (1.0f64 - a).sqrt();
+            assert!((found.mean - expected).abs() < 4.0 * found.error.max(1e-5), "{a} {mu}: {found:?} {expected}");
+        }
     }
 }

@@ -105,7 +105,7 @@ pub fn read(quantity: &str) -> Option<Quantity> {
         let g = get("g").unwrap_or(0.0) as f32;
         return Some(Quantity::Furnace(Layer { albedo: get("a").unwrap_or(1.0) as f32, g, tau, eta: eta as f32 }));
     }
-    if text.starts_with("semiinf") {
+    if text.starts_with("semi") {
         let layer = layer(f64::INFINITY)?;
         if has("BRDF") {
             let cosines = if has("normal->normal") { (1.0, 1.0) } else { (get("mu0")?, get("mu")?) };
