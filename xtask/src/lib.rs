@@ -4,6 +4,7 @@
 
 pub mod bench;
 pub mod captures;
+pub mod eval;
 pub mod fixtures;
 pub mod oracle;
 pub mod suite;

@@ -4,7 +4,7 @@ use clap::{Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use xtask::oracle::{self, OracleKind};
-use xtask::{captures, fixtures, suite, tidy};
+use xtask::{captures, eval, fixtures, suite, tidy};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
 const BENCHES: [&str; 2] = ["splat", "transport"];
@@ -16,6 +16,7 @@ Examples:
   cargo xtask oracle splat scenes/dense_1000.npz    one splat scene
   cargo xtask bench splat                           time and error of the rasteriser
   cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
+  cargo xtask eval out/grid.toml --print            the commands of a grid of reconstructions that are not done
   cargo xtask tidy --rules                          the house rules and their reasons
   cargo xtask fixtures --update                     accept the reference files as they are now
   cargo xtask fixtures --recipe                     render the small captures again and compare their bytes
@@ -61,6 +62,20 @@ enum Tool {
         /// Passed on; `cargo xtask bench splat -- --help` lists what there is.
         #[arg(last = true)]
         rest: Vec<String>,
+    },
+    /// Reconstruct methods × regimes × objects × seeds of a TOML file and write tables; done runs are kept.
+    Eval {
+        /// The file; see xtask/src/eval.rs.
+        file: PathBuf,
+        /// The program that is run.
+        #[arg(long, default_value = "target/release/diamond")]
+        program: PathBuf,
+        /// Print the commands of the runs that are not done instead.
+        #[arg(long)]
+        print: bool,
+        /// Run every Nth run only, beginning with I: I/N.
+        #[arg(long, default_value = "0/1")]
+        shard: eval::Shard,
     },
     /// Compare reference files and captures with their manifest of hashes, or rendered captures with new ones.
     Fixtures {
@@ -115,6 +130,7 @@ fn run(tool: Tool) -> Result<bool, String> {
             let arguments = ["bench", "--quiet", "--package", "xtask", "--bench", &name, "--"];
             suite::cargo(root, &arguments.into_iter().chain(rest.iter().map(String::as_str)).collect::<Vec<_>>())
         }
+        Tool::Eval { file, program, print, shard } => eval::run(root, &file, &program, print, shard),
         Tool::Fixtures { update, recipe: Some(names), .. } => {
             let mut same = true;
             for capture in captures::chosen(root, &names)? {
