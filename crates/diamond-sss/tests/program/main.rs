@@ -52,10 +52,21 @@ fn from_capture_to_report_and_pictures() {
         "log.csv",
         "profile.json",
         "run.json",
+        "selection.json",
         "checkpoint/state.safetensors",
     ] {
         assert!(out.join(name).is_file(), "{name}");
     }
+    // The same images by name: the same model. A regime keeps fewer.
+    let (selection, again, few) = (out.join("selection.json"), dir.join("again"), dir.join("few"));
+    let run = ["reconstruct", text(&capture), "-o", text(&again), "--preset", text(&config), "--steps", "6"];
+    succeed(&[&run[..], &["--selection", text(&selection)]].concat());
+    assert!(std::fs::read(again.join("model.ply")).unwrap() == std::fs::read(out.join("model.ply")).unwrap());
+    let run = ["reconstruct", text(&capture), "-o", text(&few), "--preset", text(&config), "--steps", "6"];
+    succeed(&[&run[..], &["--regime", "2x1"]].concat());
+    let kept: serde_json::Value = serde_json::from_slice(&std::fs::read(few.join("selection.json")).unwrap()).unwrap();
+    assert_eq!(kept["train"].as_array().map(|views| views.len()), Some(2));
+    assert!(kept["train"][0]["images"].as_array().is_some_and(|images| images.len() == 1));
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(!page.contains("http://") || !page.contains("src=\"http"), "the report must need no network");
     let log = std::fs::read_to_string(out.join("log.csv")).unwrap();
