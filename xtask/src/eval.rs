@@ -271,6 +271,8 @@ impl std::str::FromStr for Shard {
 pub fn run(root: &Path, file: &Path, program: &Path, print: bool, shard: Shard) -> Result<bool, String> {
     let text = std::fs::read_to_string(file).map_err(|e| format!("{}: {e}", file.display()))?;
     let grid = Grid::parse(&text).map_err(|e| format!("{}: {e}", file.display()))?;
+    // Folders in the file, and in the commands that are printed, are below the workspace wherever this is called from.
+    std::env::set_current_dir(root).map_err(|e| format!("{}: {e}", root.display()))?;
     let mut missing = 0;
     grid.write_methods()?;
     for (k, cell) in grid.cells().iter().enumerate() {
@@ -285,7 +287,7 @@ pub fn run(root: &Path, file: &Path, program: &Path, print: bool, shard: Shard) 
             continue;
         }
         println!("{} {}, seed {}", cell.names[0], cell.names[1..].join(" "), cell.seed);
-        let status = Command::new(program).args(&cell.arguments).current_dir(root).status();
+        let status = Command::new(program).args(&cell.arguments).status();
         let status = status
             .map_err(|e| format!("{}: {e}; build it with `cargo build --release --bin diamond`", program.display()))?;
         if !status.success() {
