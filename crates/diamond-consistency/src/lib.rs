@@ -11,6 +11,7 @@
 //! |---|---|
 //! | both terms of a pair, and their gradient | [`pair_consistency`], [`PairPullback::pull`] |
 //! | what became of each pixel | [`PairPullback::correspondences`], [`Fate`] |
+//! | a figure for tables, without gradient | [`Disagreement`] |
 //! | rendered, given and estimated depth | [`DepthSource`] |
 //! | scale and shift of an estimated depth | [`align_depth`] |
 //! | which views, which pixels | [`nearest_views`], [`draw_pixels`] |
@@ -49,6 +50,7 @@
 //! # Ok::<(), ConsistencyError>(())
 //! ```
 mod align;
+mod disagreement;
 mod error;
 mod options;
 mod pair;
@@ -58,6 +60,7 @@ mod silhouette;
 mod view;
 
 pub use align::{Alignment, AlignmentFit, EstimateForm, align_depth};
+pub use disagreement::Disagreement;
 pub use error::ConsistencyError;
 pub use options::{ConsistencyOptions, DepthRange, DepthSampling, Detach, SilhouettePenalty};
 pub use pair::{PairGrad, PairPullback, PairValue, PairValueGrad, pair_consistency};

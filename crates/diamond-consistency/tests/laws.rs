@@ -237,6 +237,49 @@ fn disagreement_grows() {
     }
 }
 
+/// [eq:cross-view-gap] The figure for tables: nothing on a plane, the shift itself where a view is shifted toward the second camera, however
+/// far, and nothing from a surface that hides points.
+#[test]
+fn the_figure_for_tables_is_the_gap() {
+    let cameras = [camera(Vec3::new(0.3, 0.1, 1.0), 3.0, 64), camera(Vec3::new(0.3, 0.1, 1.0), 2.8, 64)];
+    let seen = [0, 1].map(|k| look(&cameras[k], DepthKind::Z, plane(Vec3::Z)));
+    let view = |k: usize, seen: &Seen, f: &mut dyn FnMut(ViewGeometry<'_>)| {
+        let depth = DepthSource::Given(&seen.1);
+        f(ViewGeometry { camera: &cameras[k], silhouette: &seen.0, depth, mask: None });
+    };
+    let options = ConsistencyOptions::new(RANGE);
+    let of = |other: &Seen| {
+        let mut found = Disagreement::default();
+        view(0, &seen[0], &mut |from| {
+            let pixels = draw_pixels(&from, &options, 4096, 1);
+            view(1, other, &mut |to| found = Disagreement::of(&from, &to, &pixels, &options).unwrap());
+        });
+        found
+    };
+    let exact = of(&seen[1]);
+    assert!(
+        exact.mean_gap().unwrap() < 2e-6 && exact.outside_share() == Some(0.0) && exact.compared > 1000,
+        "{exact:?}"
+    );
+    // Farther in the second view, so that points lie before what it shows: beyond 5 % the loss looks away, this does not.
+    for shift in [0.05, 0.2, 0.8] {
+        let mut far = seen[1].clone();
+        far.1.values.data_mut().iter_mut().for_each(|v| *v += shift);
+        let gap = of(&far).mean_gap().unwrap();
+        assert!((gap - f64::from(shift)).abs() < 1e-5, "{shift}: {gap}");
+    }
+    // Much nearer: it hides the points, and says nothing about them.
+    let mut near = seen[1].clone();
+    near.1.values.data_mut().iter_mut().for_each(|v| *v *= 0.7);
+    let hidden = of(&near);
+    assert!(hidden.compared == 0 && hidden.mean_gap().is_none() && hidden.landed == exact.landed, "{hidden:?}");
+    let mut holed = seen[1].clone();
+    holed.0.data_mut()[..2048].fill(0.0);
+    let share = of(&holed).outside_share().unwrap();
+    assert!((0.3..0.7).contains(&share), "{share}");
+    assert_eq!(Disagreement::default().outside_share(), None);
+}
+
 /// Without a valid correspondence: zero, no gradient, no NaN.
 #[test]
 fn nothing_to_compare_costs_nothing() {

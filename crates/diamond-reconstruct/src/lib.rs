@@ -60,7 +60,7 @@ pub use objective::TermValue;
 pub use parameters::{Activated, ActivatedGrad, Attribute, GaussianParameters, Group, Layout, logit, sigmoid};
 pub use reconstruction::Reconstruction;
 pub use region::Region;
-pub use render::{LIGHTS_TOGETHER, PICTURE_BYTES, RenderWork, Renderer};
+pub use render::{LIGHTS_TOGETHER, PICTURE_BYTES, RenderWork, RenderedShape, Renderer};
 pub use scene::{InitialPoints, InitialSplats, Scene, survey};
 pub use schedule::StepPlan;
 pub use tensor_file::{TensorFile, tensor_digest, write_atomically};

@@ -22,7 +22,7 @@ use diamond_shading::{
     TransportChannels, channel,
 };
 use diamond_simd::{BLOCK, Level};
-use diamond_splat::{BlendBlock, BlendWeights, BlockBlender, KeepAll, project};
+use diamond_splat::{BlendBlock, BlendWeights, BlockBlender, Features, KeepAll, project, rasterize};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -46,6 +46,15 @@ pub struct Renderer<'m> {
     /// Bytes of visibility that are kept from one view to the next.
     kept_bytes: usize,
     kept: Mutex<BTreeMap<LightKey, Arc<Vec<f32>>>>,
+}
+
+/// What a view sees of the shape of a model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RenderedShape {
+    /// Σ w: the coverage of each pixel.
+    pub opacity: Image,
+    /// Σ w·z, scene units.
+    pub depth: Image,
 }
 
 /// How much work a view was.
@@ -207,6 +216,15 @@ impl<'m> Renderer<'m> {
             }
         }
         Ok(out)
+    }
+
+    /// What one view sees of the shape, without any light: Σ w in [0, 1) and Σ w·z (view-space z, scene units, not divided by Σ w),
+    /// of one channel each, as in training.
+    pub fn shape(&self, camera: &Camera) -> Result<RenderedShape, ReconstructError> {
+        let nothing = Features { channels: 0, data: Vec::new() };
+        let (raster, _) = rasterize(&self.activated.gaussians, &nothing, camera, &raster_config(self.model))
+            .map_err(error::stage("rasterize"))?;
+        Ok(RenderedShape { opacity: raster.opacity, depth: raster.depth })
     }
 
     /// How much work [`Renderer::radiance`] of one view is.

@@ -3,7 +3,7 @@ use crate::capture_check::open_capture;
 use crate::evaluation::{Compared, evaluate_with};
 use crate::output_file::write_json;
 use crate::picture::{encode_png_rgb, heat_bytes};
-use crate::{HeldOutGain, ImageScore, PSNR_CAP, RunRecord, Scored, SssError, write_output};
+use crate::{HeldOutGain, ImageScore, PSNR_CAP, RunRecord, Scored, ShapeScores, SssError, shape_scores, write_output};
 use diamond_dataset::{Capture, DatasetError, Selection};
 use diamond_reconstruct::Model;
 use serde_json::{Map, Value, json};
@@ -48,6 +48,8 @@ impl Summary {
 pub struct Metrics {
     /// Every held-out image.
     pub scores: Vec<ImageScore>,
+    /// The shape in every held-out view.
+    pub shape: ShapeScores,
     /// Hash of the capture that was evaluated.
     pub capture_hash: String,
     /// Seconds of the run, all sessions.
@@ -154,6 +156,7 @@ impl Metrics {
         let mut out = self.group("", &|_| true, &mut absent);
         out.insert("seen_lights".into(), self.group("seen_lights", &|s| s.seen_light, &mut absent).into());
         out.insert("unseen_lights".into(), self.group("unseen_lights", &|s| !s.seen_light, &mut absent).into());
+        out.insert("geometry".into(), self.shape.to_json(&mut absent));
         out.insert("resolution".into(), self.resolution().map(|(w, h)| vec![w, h]).into());
         if self.resolution().is_none() {
             let why = if self.scores.is_empty() { "no held-out images" } else { "sizes differ; see per_image" };
@@ -192,7 +195,10 @@ impl Metrics {
                 "gain": "of renderings before comparison: none, global (the learned one), or mean (1, the geometric mean \
                          of the learned gains of views or images)",
                 "psnr_fitted_gain": "each image under the gain that fits it best: the weighted median ratio of photograph and rendering",
-                "std": "standard deviation over images",
+                "std": "standard deviation over images, or views",
+                "geometry": "held-out views; coverage above 0.5 against the mask above 0.5; depth_error and cross_view_gap as shares \
+                             of extent: mean |rendered z - true z|, and mean difference of a point's z and the rendered z of two \
+                             neighbouring cameras; cross_view_outside: share of points outside the neighbour's silhouette",
             }),
         );
         let part = |s: &Scored| json!({ "psnr": s.psnr, "ssim": s.ssim, "flip": s.flip });
@@ -254,6 +260,7 @@ impl Metrics {
                 }
             }
         }
+        out += &format!("Shape: {}\n", self.shape.sentence());
         out += &format!("Gain of held-out images: {}\n", self.gain_sentence());
         out
     }
@@ -289,10 +296,12 @@ pub fn evaluate_folder(
         progress(done, all);
         if save_images { save(folder, &compared) } else { Ok(()) }
     })?;
+    let shape = shape_scores(&model, &crate::AtOnce::default(), &selected, &whole)?;
     let capture_hash = whole.hash()?;
     let trained_on = record.as_ref().map(|r| r.capture_hash.clone()).filter(|h| *h != capture_hash);
     let metrics = Metrics {
         scores,
+        shape,
         capture_hash,
         seconds: record.as_ref().and_then(|r| r.seconds),
         peak_bytes: record.as_ref().and_then(|r| r.peak_bytes),
@@ -324,6 +333,7 @@ mod tests {
     fn metrics(scores: Vec<ImageScore>) -> Metrics {
         Metrics {
             scores,
+            shape: ShapeScores::default(),
             capture_hash: "h".into(),
             seconds: Some(1.0),
             peak_bytes: None,

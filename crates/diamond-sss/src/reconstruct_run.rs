@@ -5,7 +5,9 @@ use crate::output_file::write_json;
 use crate::peak_memory::PeakAfter;
 use crate::render_run::holds_results;
 use crate::run_record::RunRecord;
-use crate::{AtOnce, Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, write_report};
+use crate::{
+    AtOnce, Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, shape_scores, write_report,
+};
 use diamond_dataset::{Capture, Selection, SelectionManifest};
 use diamond_reconstruct::{
     ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
@@ -354,6 +356,7 @@ fn run(
             false => Ok(()),
         }
     })?;
+    let shape = shape_scores(model, &at_once, &capture, &whole)?;
     peak_after.note("evaluation");
     let seconds = earlier.seconds + begun.elapsed().as_secs_f64();
     let peak = peak_bytes().max(earlier.peak_bytes);
@@ -362,6 +365,7 @@ fn run(
     record.write(folder)?;
     let metrics = Metrics {
         scores,
+        shape,
         capture_hash,
         seconds: Some(seconds),
         peak_bytes: peak,

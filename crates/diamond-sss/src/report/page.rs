@@ -225,6 +225,7 @@ fn facts(out: &mut String, metrics: &Metrics, record: &RunRecord, model: &Model)
         ("Steps", record.steps.to_string()),
         ("Seed", record.seed.to_string()),
         ("Gaussians", model.len().to_string()),
+        ("Shape in held-out views", metrics.shape.sentence()),
         ("Gain of held-out images", metrics.gain_sentence()),
         ("Time", seconds),
         ("Peak memory", peak),

@@ -93,6 +93,12 @@ fn from_capture_to_report_and_pictures() {
         assert!(metrics[key].is_number(), "{key}");
     }
     assert_eq!(metrics["images"], 2);
+    let shape = &metrics["geometry"];
+    assert!(shape["silhouette_iou"].as_f64().is_some_and(|iou| (0.0..=1.0).contains(&iou)), "{shape}");
+    // This capture has no true depth.
+    assert!(shape["depth_error"].is_null() && metrics["absent"]["geometry.depth_error"].is_string(), "{shape}");
+    assert_eq!(shape["extent_of"], "cameras");
+    assert!(shape["per_view"].as_array().is_some_and(|views| !views.is_empty()), "{shape}");
     assert_eq!(metrics["resolution"], serde_json::json!([32, 32]));
     assert!(metrics["absent"]["lpips_vgg"].is_string());
     assert_eq!(metrics["capture_hash"].as_str().unwrap().len(), 64);
@@ -122,7 +128,7 @@ fn from_capture_to_report_and_pictures() {
     assert_eq!(image::image_dimensions(dir.join("y.png")).unwrap(), (1200, 400));
     std::fs::write(dir.join("broken.spz"), b"NGSP").unwrap();
     assert_eq!(diamond(&["inspect", text(&dir.join("broken.spz"))]).status.code(), Some(3));
-    let again = dir.join("again");
+    let again = dir.join("from-splats");
     let words = ["reconstruct", text(&capture), "-o", text(&again), "--preset", text(&config), "--steps", "2"];
     let printed = succeed(&[&words[..], &["--initial", text(&dir.join("x.glb"))]].concat());
     assert!(String::from_utf8_lossy(&printed.stderr).contains("Gaussians of "), "{printed:?}");
