@@ -2,22 +2,29 @@
 //!
 //! Each cell of the grid is one `diamond reconstruct` into a folder of its own, and done when its `metrics.json` is there. So a
 //! grid can be interrupted and goes on where it was, cells run on any machine that has the captures (`--print`, `--shard`), and
-//! the tables are made of whatever is done, saying what is not.
+//! the tables are made of whatever is done, saying what is not: `eval.md`, `eval.html` with a plot of all runs, and `eval.csv` with a
+//! row per run, its revision, and hashes of its capture and of the images that it learned from and was measured on.
 //!
 //! ```toml
 //! output = "out/eval"          # cells go to OUTPUT/OBJECT/REGIME/METHOD/SEED
 //! steps = 4000
 //! seeds = [0, 1, 2]
 //! regimes = ["v3-l3", "3x3", "v5-full"]
+//! reference = "neither"        # the method that differences are taken from, which comes first; the first by name where absent
 //! [objects]
 //! spot = "assets/captures/spot-small"
 //! [methods.neither]
 //! [methods.both]               # what differs from the preset `base` (resolved unless it says otherwise)
 //! loss = { silhouette_consistency = 0.5, depth_consistency = 0.3 }
 //! ```
-use std::fmt::Write as _;
+mod figures;
+pub(crate) mod page;
+mod tables;
+
+pub use figures::{Better, Figures, MEASURES, Measure, csv, figures_in};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+pub use tables::{Entry, Table};
 
 /// What a file of an evaluation says.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,7 +39,7 @@ pub struct Grid {
     pub regimes: Vec<String>,
     /// Names and folders of captures, by name.
     pub objects: Vec<(String, PathBuf)>,
-    /// Names and configurations as TOML text, by name.
+    /// Names and configurations as TOML text: what differences are taken from, then the others by name.
     pub methods: Vec<(String, String)>,
 }
 
@@ -49,23 +56,8 @@ pub struct Cell {
     pub arguments: Vec<String>,
 }
 
-/// What is read of a run's figures.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Figures {
-    /// dB over all pixels.
-    pub psnr: f64,
-    /// In [−1, 1].
-    pub ssim: f64,
-    /// In [0, 1].
-    pub flip: f64,
-    /// dB inside the masks.
-    pub masked: f64,
-    /// Of the run.
-    pub seconds: f64,
-}
-
 /// Whether a name can be a folder's and a table's.
-fn plain(name: &str) -> bool {
+pub(crate) fn plain(name: &str) -> bool {
     let allowed = |c: char| c.is_ascii_alphanumeric() || "-_+.".contains(c);
     !name.is_empty() && name.chars().all(allowed) && !name.starts_with('.')
 }
@@ -74,7 +66,7 @@ impl Grid {
     /// Reads the text of a file.
     pub fn parse(text: &str) -> Result<Self, String> {
         let table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.message().to_owned())?;
-        let known = ["output", "steps", "seeds", "regimes", "objects", "methods"];
+        let known = ["output", "steps", "seeds", "regimes", "reference", "objects", "methods"];
         if let Some(key) = table.keys().find(|k| !known.contains(&k.as_str())) {
             return Err(format!("`{key}` is no key of an evaluation; expected {}", known.join(", ")));
         }
@@ -105,6 +97,11 @@ impl Grid {
             settings.entry("base").or_insert("resolved".into());
             settings.insert("name".into(), name.as_str().into());
             methods.push((name.clone(), toml::to_string(&settings).map_err(|e| e.to_string())?));
+        }
+        if let Some(reference) = table.get("reference") {
+            let place = methods.iter().position(|(name, _)| Some(name.as_str()) == reference.as_str());
+            let place = place.ok_or(format!("`reference` must be the name of a method, found {reference}"))?;
+            methods[..=place].rotate_right(1);
         }
         Ok(Self {
             output: output.into(),
@@ -170,75 +167,9 @@ impl Grid {
         }
         cells
     }
-
-    /// The table as Markdown: for each object a row per regime and a column per method, mean ± standard deviation over seeds.
-    pub fn markdown(&self, done: &[(Cell, Figures)]) -> String {
-        let mut out = String::from(
-            "PSNR dB / SSIM / FLIP over all pixels of the held-out images (PSNR inside the masks), mean ± standard deviation \
-             of PSNR over seeds, seconds of a run; – is not done.\n",
-        );
-        let all = self.cells().len();
-        let _ = writeln!(out, "{} of {all} runs are done.", done.len());
-        for (object, capture) in &self.objects {
-            let _ = writeln!(out, "\n### {object} (`{}`)\n", capture.display());
-            let names: Vec<&str> = self.methods.iter().map(|(name, _)| name.as_str()).collect();
-            let _ = writeln!(out, "| regime | {} |\n|---|{}", names.join(" | "), "---|".repeat(names.len()));
-            for regime in &self.regimes {
-                let cell = |method: &str| {
-                    let of = |(c, _): &&(Cell, Figures)| c.names == [object.as_str(), regime.as_str(), method];
-                    let runs: Vec<Figures> = done.iter().filter(of).map(|(_, f)| *f).collect();
-                    summary(&runs)
-                };
-                let cells: Vec<String> = names.iter().map(|m| cell(m)).collect();
-                let _ = writeln!(out, "| {regime} | {} |", cells.join(" | "));
-            }
-        }
-        out
-    }
-
-    /// Every run that is done, as CSV.
-    pub fn csv(done: &[(Cell, Figures)]) -> String {
-        let mut out = String::from("object,regime,method,seed,psnr,ssim,flip,psnr_masked,seconds\n");
-        for (cell, f) in done {
-            let names = cell.names.join(",");
-            let _ = writeln!(out, "{names},{},{},{},{},{},{}", cell.seed, f.psnr, f.ssim, f.flip, f.masked, f.seconds);
-        }
-        out
-    }
 }
 
-fn mean(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
-    let n = values.clone().count().max(1) as f64;
-    let mean = values.clone().sum::<f64>() / n;
-    (mean, (values.map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt())
-}
-
-/// A cell of the table.
-fn summary(runs: &[Figures]) -> String {
-    if runs.is_empty() {
-        return "–".into();
-    }
-    let of = |f: fn(&Figures) -> f64| mean(runs.iter().map(f));
-    let (psnr, deviation) = of(|f| f.psnr);
-    let [ssim, flip, masked, seconds] = [of(|f| f.ssim).0, of(|f| f.flip).0, of(|f| f.masked).0, of(|f| f.seconds).0];
-    format!("{psnr:.2} ± {deviation:.2} / {ssim:.3} / {flip:.3} ({masked:.2}) {seconds:.0} s")
-}
-
-/// The figures of a cell, if it is done.
-pub fn figures(cell: &Cell) -> Option<Figures> {
-    let text = std::fs::read_to_string(cell.folder.join("metrics.json")).ok()?;
-    let json: serde_json::Value = serde_json::from_str(&text).ok()?;
-    let number = |value: &serde_json::Value| value.as_f64().unwrap_or(f64::NAN);
-    Some(Figures {
-        psnr: number(&json["psnr"]),
-        ssim: number(&json["ssim"]),
-        flip: number(&json["flip"]),
-        masked: number(&json["masked"]["psnr"]),
-        seconds: number(&json["seconds"]),
-    })
-}
-
-fn write(path: &Path, text: &str) -> Result<(), String> {
+pub(crate) fn write(path: &Path, text: &str) -> Result<(), String> {
     let fail = |e: std::io::Error| format!("{}: {e}", path.display());
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder).map_err(fail)?;
@@ -267,41 +198,75 @@ impl std::str::FromStr for Shard {
     }
 }
 
-/// Runs what is not done (or prints the commands), then writes `eval.md` and `eval.csv` of what is. Whether nothing failed or is left.
-pub fn run(root: &Path, file: &Path, program: &Path, print: bool, shard: Shard) -> Result<bool, String> {
+/// The revision of the workspace, with a mark where files differ from it; "unknown" outside a repository.
+pub fn revision() -> String {
+    let git = |arguments: &[&str]| {
+        let output = Command::new("git").args(arguments).output().ok().filter(|o| o.status.success())?;
+        Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    };
+    let Some(revision) = git(&["rev-parse", "--short=12", "HEAD"]) else { return "unknown".into() };
+    let clean = git(&["status", "--porcelain", "--untracked-files=no"]).is_some_and(|changes| changes.is_empty());
+    if clean { revision } else { revision + "+changes" }
+}
+
+/// Starts the program for a run in `folder`, after the revision is written there. Whether it succeeded.
+pub(crate) fn start(program: &Path, folder: &Path, arguments: &[String], revision: &str) -> Result<bool, String> {
+    let cell = serde_json::json!({ "revision": revision, "command": arguments.join(" ") });
+    write(&folder.join(figures::CELL_FILE), &format!("{cell:#}\n"))?;
+    let status = Command::new(program).args(arguments).status();
+    let status = status
+        .map_err(|e| format!("{}: {e}; build it with `cargo build --release --bin diamond`", program.display()))?;
+    if !status.success() {
+        println!("  failed ({status})");
+    }
+    Ok(status.success())
+}
+
+/// How cells are run.
+#[derive(Debug, Clone)]
+pub struct How {
+    /// The program.
+    pub program: PathBuf,
+    /// Print the commands of what is missing instead.
+    pub print: bool,
+    /// Which part of the grid.
+    pub shard: Shard,
+    /// What the program was built from; the workspace's revision where absent.
+    pub revision: Option<String>,
+}
+
+/// Runs what is not done (or prints the commands), then writes `eval.md`, `eval.html` and `eval.csv` of what is. Whether nothing failed or is left.
+pub fn run(root: &Path, file: &Path, how: &How) -> Result<bool, String> {
     let text = std::fs::read_to_string(file).map_err(|e| format!("{}: {e}", file.display()))?;
     let grid = Grid::parse(&text).map_err(|e| format!("{}: {e}", file.display()))?;
     // Folders in the file, and in the commands that are printed, are below the workspace wherever this is called from.
     std::env::set_current_dir(root).map_err(|e| format!("{}: {e}", root.display()))?;
     let mut missing = 0;
     grid.write_methods()?;
-    for (k, cell) in grid.cells().iter().enumerate() {
-        if figures(cell).is_some() {
+    let revision = how.revision.clone().unwrap_or_else(revision);
+    let cells = grid.cells();
+    for (k, cell) in cells.iter().enumerate() {
+        if figures_in(&cell.folder).is_some() {
             continue;
         }
-        if print || k % shard.of != shard.index {
+        if how.print || k % how.shard.of != how.shard.index {
             missing += 1;
-            if print {
-                println!("{} {}", program.display(), cell.arguments.join(" "));
+            if how.print {
+                println!("{} {}", how.program.display(), cell.arguments.join(" "));
             }
             continue;
         }
-        println!("{} {}, seed {}", cell.names[0], cell.names[1..].join(" "), cell.seed);
-        let status = Command::new(program).args(&cell.arguments).status();
-        let status = status
-            .map_err(|e| format!("{}: {e}; build it with `cargo build --release --bin diamond`", program.display()))?;
-        if !status.success() {
-            missing += 1;
-            println!("  failed ({status})");
-        }
+        println!("{} of {}: {} {}, seed {}", k + 1, cells.len(), cell.names[0], cell.names[1..].join(" "), cell.seed);
+        missing += usize::from(!start(&how.program, &cell.folder, &cell.arguments, &revision)?);
     }
-    let done: Vec<(Cell, Figures)> = grid.cells().into_iter().filter_map(|c| figures(&c).map(|f| (c, f))).collect();
-    write(&grid.output.join("eval.md"), &grid.markdown(&done))?;
-    write(&grid.output.join("eval.csv"), &Grid::csv(&done))?;
-    if !print {
-        println!("{}: {} of {} runs", grid.output.join("eval.md").display(), done.len(), grid.cells().len());
+    let done: Vec<(Cell, Figures)> = cells.into_iter().filter_map(|c| figures_in(&c.folder).map(|f| (c, f))).collect();
+    for (name, text) in [("eval.md", grid.markdown(&done)), ("eval.html", grid.html(&done)), ("eval.csv", csv(&done))] {
+        write(&grid.output.join(name), &text)?;
     }
-    Ok(print || missing == 0)
+    if !how.print {
+        println!("{}: {} of {} runs", grid.output.join("eval.html").display(), done.len(), grid.cells().len());
+    }
+    Ok(how.print || missing == 0)
 }
 
 #[cfg(test)]
@@ -338,19 +303,93 @@ mod tests {
         assert!(error("\"3x3\"", "\"../x\"").contains("regimes"));
         assert!(error("methods.both", "methods.\"a/b\"").contains("a/b"));
         assert!(error("spot =", "# spot =").contains("objects"));
+        assert!(error("steps = 50", "reference = \"none\"").contains("reference"));
         assert!("4/4".parse::<Shard>().is_err() && "0/4".parse::<Shard>() == Ok(Shard { index: 0, of: 4 }));
     }
 
+    fn figures(psnr: f64, depth: Option<f64>) -> Figures {
+        let mut values = [None; MEASURES.len()];
+        for (key, value) in [
+            ("psnr", Some(psnr)),
+            ("ssim", Some(0.9)),
+            ("flip", Some(0.1)),
+            ("psnr_masked", Some(20.0)),
+            ("depth_error", depth),
+            ("seconds", Some(60.0)),
+        ] {
+            values[figures::index(key).unwrap()] = value;
+        }
+        Figures { values, revision: "abc".into(), capture: "c1".into(), selection: "s1".into() }
+    }
+
+    /// Half of the grid: method `both` is worse by 1 dB in one seed and better by 2 in the other, with half the depth error.
+    fn half(grid: &Grid) -> Vec<(Cell, Figures)> {
+        let figures = |c: &Cell| match (c.names[2].as_str(), c.seed) {
+            ("neither", 0) => figures(30.0, Some(0.04)),
+            ("neither", _) => figures(31.0, Some(0.04)),
+            (_, 0) => figures(29.0, Some(0.02)),
+            _ => figures(33.0, Some(0.02)),
+        };
+        grid.cells().into_iter().filter(|c| c.names[1] == "3x3").map(|c| (c.clone(), figures(&c))).collect()
+    }
+
     #[test]
-    fn tables_say_what_is_done() {
-        let grid = Grid::parse(FILE).unwrap();
-        let f = |psnr| Figures { psnr, ssim: 0.9, flip: 0.1, masked: 20.0, seconds: 60.0 };
-        let done: Vec<(Cell, Figures)> =
-            grid.cells().into_iter().filter(|c| c.names[1] == "3x3").zip([30.0, 31.0, 32.0, 33.0].map(f)).collect();
+    fn tables_say_what_is_done_and_what_is_best() {
+        let grid = Grid::parse(&format!("reference = \"neither\"\n{FILE}")).unwrap();
+        assert_eq!(grid.methods[0].0, "neither");
+        let done = half(&grid);
         let text = grid.markdown(&done);
-        assert!(text.contains("4 of 8 runs are done"), "{text}");
-        assert!(text.contains("| v3-l3 | – | – |"), "{text}");
-        assert!(text.contains("31.00 ± 1.00 / 0.900 / 0.100 (20.00) 60 s"), "{text}");
-        assert_eq!(Grid::csv(&done).lines().count(), 5);
+        for expected in [
+            "4 of 8 runs are done",
+            "| regime | neither | both |",
+            "| v3-l3 | – | – |",
+            "| 3x3 | 30.50 ± 0.50 / 0.900 / 0.100 (20.00) | **31.00 ± 2.00 / 0.900 / 0.100 (20.00)** |",
+            "| both | **31.00 ± 2.00** | 0.9000 ± 0.0000 |",
+            // Half a decibel with a standard error of one and a half is no gain; half the depth error is.
+            "| 3x3, both | 2 | +0.50 ± 1.50 |",
+            "| **-2.00 ± 0.00** | × 1.00 |",
+        ] {
+            assert!(text.contains(expected), "{expected} in {text}");
+        }
+        assert!(!text.contains("LPIPS VGG") && !text.contains("NaN"), "{text}");
+        let table = csv(&done);
+        assert_eq!(table.lines().count(), 5);
+        assert!(table.lines().next().unwrap().ends_with("revision,capture_hash,selection_hash"));
+        assert!(table.lines().all(|l| l.split(',').count() == MEASURES.len() + 7), "{table}");
+        assert!(table.contains("abc,c1,s1"));
+    }
+
+    #[test]
+    fn the_page_needs_nothing_else() {
+        let grid = Grid::parse(FILE).unwrap();
+        let page = grid.html(&half(&grid));
+        assert_eq!(page.matches("<circle").count(), 4);
+        assert!(page.contains("class=\"best\"") && !page.contains("NaN") && !page.contains("inf"), "{page}");
+        for foreign in ["<script", "href=", "src=", "url("] {
+            assert!(!page.contains(foreign), "{foreign}");
+        }
+        // Nothing done, and a single run: pages all the same.
+        for few in [0, 1] {
+            let page = grid.html(&half(&grid)[..few]);
+            assert!(page.contains("</html>") && !page.contains("NaN") && !page.contains("inf"), "{page}");
+        }
+    }
+
+    #[test]
+    fn what_a_run_wrote_is_read() {
+        let folder = std::env::temp_dir().join(format!("diamond-xtask-eval-{}", std::process::id()));
+        assert_eq!(figures_in(&folder), None);
+        let metrics = r#"{"psnr": 30.5, "lpips_vgg": null, "masked": {"psnr": 21.0}, "geometry": {"silhouette_iou": 0.9}, "capture_hash": "77"}"#;
+        write(&folder.join("metrics.json"), metrics).unwrap();
+        let bare = figures_in(&folder).unwrap();
+        assert_eq!((bare.revision.as_str(), bare.selection.as_str(), bare.capture.as_str()), ("", "", "77"));
+        write(&folder.join("cell.json"), r#"{"revision": "r1"}"#).unwrap();
+        write(&folder.join("selection.json"), "{}").unwrap();
+        let found = figures_in(&folder).unwrap();
+        let value = |key: &str| found.values[figures::index(key).unwrap()];
+        assert_eq!((value("psnr"), value("psnr_masked"), value("silhouette_iou")), (Some(30.5), Some(21.0), Some(0.9)));
+        assert_eq!((value("lpips_vgg"), value("depth_error")), (None, None));
+        assert!(found.revision == "r1" && found.selection.len() == 64);
+        std::fs::remove_dir_all(folder).unwrap();
     }
 }

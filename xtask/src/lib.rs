@@ -9,3 +9,4 @@ pub mod fixtures;
 pub mod oracle;
 pub mod suite;
 pub mod tidy;
+pub mod tune;

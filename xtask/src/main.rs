@@ -4,7 +4,7 @@ use clap::{Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use xtask::oracle::{self, OracleKind};
-use xtask::{captures, eval, fixtures, suite, tidy};
+use xtask::{captures, eval, fixtures, suite, tidy, tune};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
 const BENCHES: [&str; 2] = ["splat", "transport"];
@@ -17,6 +17,7 @@ Examples:
   cargo xtask bench splat                           time and error of the rasteriser
   cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
   cargo xtask eval out/grid.toml --print            the commands of a grid of reconstructions that are not done
+  cargo xtask tune out/tune.toml                    search settings on training images that are held out
   cargo xtask tidy --rules                          the house rules and their reasons
   cargo xtask fixtures --update                     accept the reference files as they are now
   cargo xtask fixtures --recipe                     render the small captures again and compare their bytes
@@ -76,6 +77,20 @@ enum Tool {
         /// Run every Nth run only, beginning with I: I/N.
         #[arg(long, default_value = "0/1")]
         shard: eval::Shard,
+        /// What the program was built from, for the records; the workspace's revision unless told otherwise.
+        #[arg(long)]
+        revision: Option<String>,
+    },
+    /// Search settings of a TOML file on training images that are held out, and draw the trials; done trials are kept.
+    Tune {
+        /// The file; see xtask/src/tune.rs.
+        file: PathBuf,
+        /// The program that is run.
+        #[arg(long, default_value = "target/release/diamond")]
+        program: PathBuf,
+        /// What the program was built from, for the records; the workspace's revision unless told otherwise.
+        #[arg(long)]
+        revision: Option<String>,
     },
     /// Compare reference files and captures with their manifest of hashes, or rendered captures with new ones.
     Fixtures {
@@ -130,7 +145,10 @@ fn run(tool: Tool) -> Result<bool, String> {
             let arguments = ["bench", "--quiet", "--package", "xtask", "--bench", &name, "--"];
             suite::cargo(root, &arguments.into_iter().chain(rest.iter().map(String::as_str)).collect::<Vec<_>>())
         }
-        Tool::Eval { file, program, print, shard } => eval::run(root, &file, &program, print, shard),
+        Tool::Eval { file, program, print, shard, revision } => {
+            eval::run(root, &file, &eval::How { program, print, shard, revision })
+        }
+        Tool::Tune { file, program, revision } => tune::run(root, &file, &program, revision),
         Tool::Fixtures { update, recipe: Some(names), .. } => {
             let mut same = true;
             for capture in captures::chosen(root, &names)? {
