@@ -142,7 +142,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         picture[3 * i..3 * i + 3].copy_from_slice(&match c.fate {
             Fate::Empty | Fate::NoDepth => [0, 0, 0],
             Fate::Behind | Fate::Outside => [0, 0, 60],
-            Fate::Hidden => [0, 90, 0],
+            Fate::Hidden | Fate::Averted => [0, 90, 0],
             Fate::Hollow | Fate::Seen => {
                 let (red, blue) = (shade(c.depth_cost, 0.01), shade(c.silhouette_cost, 1.0));
                 [90.max(red), 90, 90.max(blue)]

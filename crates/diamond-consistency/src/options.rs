@@ -58,6 +58,10 @@ pub struct ConsistencyOptions {
     /// A point is hidden in the second view where the depths differ by this share of its own or more; infinity to look at
     /// hidden points as well.
     pub max_gap: f32,
+    /// A point is averted where the surface of the first view, by its own depth, faces the second camera with a smaller cosine than
+    /// this; −1 to look at all points. On the far side of an object the second view often shows another surface at nearly the same
+    /// depth, which no gap tells from the same one.
+    pub min_facing: f32,
     /// Whose maps are constants.
     pub detach: Detach,
     /// Whether the silhouette term pulls on the first view's silhouette as the label as well. With cross-entropy that pull is
@@ -67,7 +71,7 @@ pub struct ConsistencyOptions {
 
 impl ConsistencyOptions {
     /// The defaults for a scene in this range: cross-entropy, view-space z read in 1/z, silhouettes above ½, gaps below
-    /// 5 %, the gradient to everything.
+    /// 5 %, surfaces of any direction, the gradient to everything.
     pub fn new(range: DepthRange) -> Self {
         Self {
             penalty: SilhouettePenalty::default(),
@@ -76,6 +80,7 @@ impl ConsistencyOptions {
             range,
             min_silhouette: 0.5,
             max_gap: 0.05,
+            min_facing: -1.0,
             detach: Detach::default(),
             label_gradient: true,
         }
@@ -92,6 +97,9 @@ impl ConsistencyOptions {
         }
         if !(0.0..1.0).contains(&self.min_silhouette) {
             return fail("min_silhouette", "a number in [0, 1)", self.min_silhouette);
+        }
+        if !(-1.0..1.0).contains(&self.min_facing) {
+            return fail("min_facing", "a cosine in [-1, 1)", self.min_facing);
         }
         if self.max_gap.is_nan() || self.max_gap <= 0.0 {
             return fail("max_gap", "a share above 0, or infinity", self.max_gap);

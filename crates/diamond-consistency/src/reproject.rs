@@ -22,6 +22,9 @@ pub enum Fate {
     /// The second view shows something nearer there, or something much farther. The silhouette term counts it: a hidden
     /// point lands inside the silhouette as well.
     Hidden,
+    /// The depths agree, but the first view's surface faces away from the second camera, which therefore shows another one; or the first
+    /// view does not say how the surface lies. As if it were hidden.
+    Averted,
     /// Both views show the point.
     Seen,
 }
@@ -29,7 +32,7 @@ pub enum Fate {
 impl Fate {
     /// Whether the silhouette term counts it.
     pub fn has_silhouette(self) -> bool {
-        matches!(self, Self::Hollow | Self::Hidden | Self::Seen)
+        matches!(self, Self::Hollow | Self::Hidden | Self::Averted | Self::Seen)
     }
 
     /// Whether the depth term counts it.
@@ -166,6 +169,36 @@ pub(crate) fn correspond(
     let Some(surface_z) = z_at(to, &taps, options).filter(|_| shows(c.silhouette)) else { return c };
     c.surface_z = surface_z;
     let gap = (z - surface_z).abs() / z;
-    c.fate = if gap < options.max_gap { Fate::Seen } else { Fate::Hidden };
+    c.fate = if gap >= options.max_gap {
+        Fate::Hidden
+    } else if options.min_facing > -1.0
+        && !facing(from, index, to.camera.pose.centre(), options).is_some_and(|cosine| cosine > options.min_facing)
+    {
+        Fate::Averted
+    } else {
+        Fate::Seen
+    };
     c
+}
+
+/// Cosine between the normal of the surface at a pixel, by the depths of the pixels beside it, and the direction to a place in the world. `None` where
+/// there is no pixel that shows the object on either side of it in a row or a column.
+fn facing(view: &ViewGeometry<'_>, pixel: usize, place: Vec3, options: &ConsistencyOptions) -> Option<f32> {
+    let (width, height) = view.size();
+    let (x, y) = (pixel % width, pixel / width);
+    let point = |pixel: usize| {
+        let shown = view.silhouette.data()[pixel] > options.min_silhouette;
+        view.z(pixel).filter(|_| shown).map(|z| view.camera.unproject(view.centre(pixel), Depth::Z(z)))
+    };
+    let here = point(pixel)?;
+    // From the pixel before to the pixel behind, or to or from this one at an edge.
+    let along = |at: usize, last: usize, step: usize| {
+        let before = (at > 0).then(|| point(pixel - step)).flatten();
+        let behind = (at < last).then(|| point(pixel + step)).flatten();
+        (before.is_some() || behind.is_some()).then(|| behind.unwrap_or(here) - before.unwrap_or(here))
+    };
+    let normal = along(x, width - 1, 1)?.cross(along(y, height - 1, width)?).try_normalize()?;
+    // Toward the camera that sees it.
+    let normal = if normal.dot(view.camera.pose.centre() - here) < 0.0 { -normal } else { normal };
+    Some(normal.dot((place - here).try_normalize()?))
 }

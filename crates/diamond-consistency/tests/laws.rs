@@ -280,6 +280,44 @@ fn the_figure_for_tables_is_the_gap() {
     assert_eq!(Disagreement::default().outside_share(), None);
 }
 
+/// A sphere from two sides far apart: many points that the second view does not show have nearly the depth of what it does show there, and pass the
+/// gap. Their surface faces away from it, and that tells them apart. What faces both cameras stays.
+#[test]
+fn averted_points_are_not_compared() {
+    let first = camera(Vec3::new(0.0, 0.3, 1.0), 3.0, 64);
+    // Cosines of the true surface of the points that are compared, and how many land.
+    let of = |second: Vec3, min_facing: f32| -> (Vec<f32>, usize) {
+        let cameras = [first, camera(second, 3.0, 64)];
+        let seen = [0, 1].map(|k| look(&cameras[k], DepthKind::Z, sphere(1.0)));
+        let options = ConsistencyOptions { min_facing, max_gap: 0.2, ..ConsistencyOptions::new(RANGE) };
+        let view = |k: usize| {
+            let depth = DepthSource::Given(&seen[k].1);
+            ViewGeometry { camera: &cameras[k], silhouette: &seen[k].0, depth, mask: None }
+        };
+        let pixels = draw_pixels(&view(0), &options, usize::MAX, 0);
+        let (value, pullback) = pair_consistency(&view(0), &view(1), &pixels, &options).unwrap();
+        let eye = cameras[1].pose.centre();
+        let compared = pullback.correspondences().iter().filter(|c| c.fate == Fate::Seen);
+        (compared.map(|c| c.world.normalize().dot((eye - c.world).normalize())).collect(), value.silhouette_count)
+    };
+    let (far, beside) = (Vec3::new(1.0, 0.0, -0.5), Vec3::new(0.2, 0.3, 1.0));
+    let (all, landed) = of(far, -1.0);
+    let averted = all.iter().filter(|cosine| **cosine < 0.0).count();
+    assert!(averted > 100 && 2 * averted > all.len(), "{averted} of {}", all.len());
+    let (facing, same) = of(far, 0.0);
+    // But for pixels at the outline, where a normal from one side is coarse.
+    let wrong = facing.iter().filter(|cosine| **cosine < -0.1).count();
+    assert!(20 * wrong <= facing.len(), "{wrong} of {}", facing.len());
+    assert!(10 * facing.len() >= 7 * (all.len() - averted), "{} of {}", facing.len(), all.len() - averted);
+    assert_eq!(landed, same);
+    // The more it asks, the fewer remain.
+    let counts = [-1.0, 0.0, 0.3, 0.6, 0.9].map(|cosine| of(beside, cosine).0.len());
+    assert!(
+        counts[1] * 10 > counts[0] * 9 && counts.windows(2).all(|w| w[1] <= w[0]) && counts[4] < counts[2],
+        "{counts:?}"
+    );
+}
+
 /// Without a valid correspondence: zero, no gradient, no NaN.
 #[test]
 fn nothing_to_compare_costs_nothing() {
@@ -353,6 +391,10 @@ fn refusals_say_what_to_do() {
     let nan = silhouette.map(|_| f32::NAN);
     let other = ViewGeometry { silhouette: &nan, ..given };
     assert!(matches!(pair_consistency(&other, &given, &pixels, &options), Err(ConsistencyError::NonFinite { .. })));
+    for min_facing in [1.0, -1.5, f32::NAN] {
+        let wrong = ConsistencyOptions { min_facing, ..options };
+        assert!(matches!(pair_consistency(&given, &given, &pixels, &wrong), Err(ConsistencyError::Setting { .. })));
+    }
     for range in [
         DepthRange { near: 2.0, far: 2.0 },
         DepthRange { near: -1.0, far: 2.0 },

@@ -71,6 +71,7 @@ fn options(model: &Model, camera: &Camera) -> ConsistencyOptions {
         label_gradient: settings.label == ConsistencyLabel::Rendered,
         min_silhouette: settings.min_opacity,
         max_gap: settings.max_gap,
+        min_facing: settings.min_facing,
         ..ConsistencyOptions::new(DepthRange { near, far: (distance + radius).max(2.0 * near) })
     }
 }

@@ -588,6 +588,9 @@ pub struct Consistency {
     pub min_opacity: f32,
     /// A point is hidden where depths differ by this share or more.
     pub max_gap: f32,
+    /// The depth term leaves out points whose surface, by the photograph's view, faces the other camera with a smaller cosine than this; −1 for
+    /// none.
+    pub min_facing: f32,
 }
 
 impl Default for Consistency {
@@ -605,6 +608,7 @@ impl Default for Consistency {
             detach: SettingDetach::default(),
             min_opacity: 0.5,
             max_gap: 0.05,
+            min_facing: -1.0,
         }
     }
 }
@@ -846,6 +850,10 @@ impl Config {
                 "`initial.opacity` must lie strictly between 0 and 1, found {}",
                 self.initial.opacity
             ));
+        }
+        if !(-1.0..1.0).contains(&self.consistency.min_facing) {
+            let found = self.consistency.min_facing;
+            return fail(format!("`consistency.min_facing` must lie in [-1, 1), found {found}"));
         }
         if self.consistency.min_opacity >= 1.0 {
             return fail("`consistency.min_opacity` must lie below 1: nothing is more opaque".into());
