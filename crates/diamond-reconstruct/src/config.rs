@@ -954,6 +954,7 @@ mod tests {
         assert!(error("base = \"nope\"").contains("nope"));
         assert!(error("[loss]\nmask = -1.0").contains("loss.mask"));
         assert!(error("[initial]\nopacity = 1.0").contains("initial.opacity"));
+        assert!(error("[consistency]\nmin_facing = 1.0").contains("consistency.min_facing"));
         assert!(error("steps = \"many\"").contains("mine.toml"));
         assert!(error("memory_limit = \"much\"").contains("512 MiB"), "{}", error("memory_limit = \"much\""));
     }

@@ -71,8 +71,9 @@ fn main() -> Result<(), Failure> {
     let span = f64::from(depths().fold(0.0, f32::max) - depths().fold(f32::INFINITY, f32::min));
     let plain = ConsistencyOptions::new(DepthRange { near: 0.0, far: 1.0 });
     let options = ConsistencyOptions { max_gap, min_facing, ..plain };
-    // Pixels counted by the term, its sum of gaps, and of errors of depth: right, wrong.
+    // Pixels counted by the term, its sum of gaps, of errors of depth, and of these with their sign: right, wrong.
     let (mut pixels, mut counts, mut gaps, mut errors) = (0usize, [0usize; 2], [0.0f64; 2], [0.0f64; 2]);
+    let mut signed = [0.0f64; 2];
     let mut missed = 0usize;
     for (i, from) in all.iter().enumerate() {
         for to in all.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, to)| to) {
@@ -93,6 +94,7 @@ fn main() -> Result<(), Failure> {
                 counts[k] += 1;
                 gaps[k] += f64::from((m.z - m.surface_z).abs());
                 errors[k] += from.error(m.pixel as usize).abs();
+                signed[k] += from.error(m.pixel as usize);
             }
         }
     }
@@ -105,10 +107,11 @@ fn main() -> Result<(), Failure> {
     for (k, name) in ["right", "wrong"].iter().enumerate() {
         let mean = |sum: f64| 100.0 * sum / span / counts[k].max(1) as f64;
         println!(
-            "{name}: {:5.1} % of pixels, mean gap {:.2} %, mean error of depth {:.2} %",
+            "{name}: {:5.1} % of pixels, mean gap {:.2} %, mean error of depth {:.2} % ({:+.2} %, + is behind the true surface)",
             share(counts[k]),
             mean(gaps[k]),
-            mean(errors[k])
+            mean(errors[k]),
+            mean(signed[k])
         );
     }
     println!("truly seen in both and not counted: {:.1} %", share(missed));
