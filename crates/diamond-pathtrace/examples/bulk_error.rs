@@ -141,7 +141,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let start = Instant::now();
             let view = bulk.render(&cameras[0], 0)?;
             let rendered = start.elapsed().as_secs_f32();
-            let e = BulkError::against(&scene, &options, &cameras, &references, &|_| ())?;
+            let e = BulkError::against(&scene, &options, &cameras, &references, f32::INFINITY, &|_| ())?;
             println!(
                 "| {setting} | {} | {solve:.1} | {rendered:.2} | {:.0} | {:+.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.1} |",
                 bulk.points(),

@@ -3,7 +3,7 @@ use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_light::LightRig;
 use diamond_pathtrace::{
     Boundary, Bulk, BulkError, BulkOptions, Coat, Geometry, Light, Material, Medium, Mesh, PathtraceError,
-    ReferenceOptions, Scene, measure_bulk, render_reference,
+    ReferenceOptions, Scene, measure_bulk, reference_pairs, render_reference,
 };
 use glam::Vec3;
 
@@ -34,7 +34,7 @@ const OBLIQUE: [Vec3; 3] = [Vec3::new(0.3, 0.5, 1.0), Vec3::new(1.0, 0.2, -0.1),
 
 fn measured(scene: &Scene, options: &BulkOptions, side: u32, samples: u32) -> BulkError {
     let reference = ReferenceOptions { samples, seed: 5, ..Default::default() };
-    measure_bulk(scene, options, &[camera(Vec3::new(0.0, 0.5, 3.9), side)], &reference, &|_| ()).unwrap()
+    measure_bulk(scene, options, &[camera(Vec3::new(0.0, 0.5, 3.9), side)], &reference, f32::INFINITY, &|_| ()).unwrap()
 }
 
 fn assert_small(error: &BulkError, rmse: f64) {
@@ -71,6 +71,24 @@ fn a_refracting_sphere_agrees_with_the_reference() {
     let scene = Scene { geometry: sphere(), material, lights: lamps(&OBLIQUE) };
     let options = BulkOptions { points: 500, walks: 500, ..Default::default() };
     assert_small(&measured(&scene, &options, 10, 4000), 0.15);
+}
+
+/// What is beyond white does not count, and what is below counts as before.
+#[test]
+fn errors_are_those_of_what_film_shows() {
+    let coat = Some(Coat { roughness: 0.05, f0: Vec3::splat(0.04) });
+    let material = Material { coat, ..Material::index_matched(Medium::gray(8.0, 0.8, 0.0)) };
+    let scene = Scene { geometry: sphere(), material, lights: lamps(&OBLIQUE[..1]) };
+    let options = BulkOptions { points: 60, walks: 64, samples_per_axis: 2, ..Default::default() };
+    let reference = ReferenceOptions { samples: 32, seed: 5, ..Default::default() };
+    let cameras = [camera(Vec3::new(0.0, 0.5, 3.9), 16)];
+    let references = reference_pairs(&scene, &cameras, &reference).unwrap();
+    let error = |white| BulkError::against(&scene, &options, &cameras, &references, white, &|_| ()).unwrap();
+    let (all, some, none) = (error(f32::INFINITY), error(0.5), error(0.0));
+    assert_eq!(all.rmse, all.rmse_beyond_white);
+    assert_eq!((some.rmse_beyond_white, some.bias), (all.rmse_beyond_white, all.bias));
+    assert!(0.0 < some.rmse && some.rmse < 0.8 * all.rmse, "{some:?}");
+    assert_eq!(none.rmse, 0.0);
 }
 
 /// A white object in light from everywhere is as bright as the light, if nothing shines through; in bulk as in nature.

@@ -9,7 +9,7 @@
 use diamond_image::{Image, Transfer};
 use diamond_light::Falloff;
 use diamond_pathtrace::{Bulk, BulkError, BulkOptions, BulkView, Light, LightImage, ReferenceImage, reference_pairs};
-use diamond_synth::{Measurement, Object, Plan, Recipe};
+use diamond_synth::{Measurement, Object, Plan, Recipe, exposure};
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -111,15 +111,16 @@ fn main() -> Result<(), Box<dyn Error>> {
     arguments.retain(|a| !a.contains('='));
     let (paths, files) = arguments.split_first().ok_or("expected PATHS and recipes")?;
     println!(
-        "| recipe | points × walks | bias % | ± | RMSE % | ± | systematic % | noise % | noise dB | solve CPU s | view CPU s | reference CPU s |"
+        "| recipe | points × walks | bias % | ± | RMSE % | ± | beyond white % | systematic % | noise % | noise dB | solve CPU s | view CPU s | reference CPU s |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     for file in files {
         let mut recipe = Recipe::parse_changed(&std::fs::read_to_string(file)?, file, &changes)?;
         recipe.quality.measured_paths = paths.parse()?;
         let object = Object::new(&recipe, Path::new(file).parent().unwrap_or(Path::new("")))?;
         let plan = Plan::new(&recipe)?;
-        let m = Measurement::new(&recipe, &object, &plan);
+        let white = 1.0 / exposure(&recipe, &object, &plan, &|_| ())?;
+        let m = Measurement::new(&recipe, &object, &plan, white);
         let start = Instant::now();
         let mut last = processor_seconds(start);
         let mut lap = || {
@@ -149,9 +150,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             Bulk::solve(&m.scene, &BulkOptions { walks, seed, ..m.bulk }, &|_| ())
         };
         let halves = [half(1)?, half(2)?];
-        let e = BulkError::between(&bulk, [&halves[0], &halves[1]], &m.cameras, &references)?;
+        let e = BulkError::between(&bulk, [&halves[0], &halves[1]], &m.cameras, &references, m.white)?;
         println!(
-            "| {} | {} × {} | {:+.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.1} | {solve:.1} | {rendered:.2} | {reference:.0} |",
+            "| {} | {} × {} | {:+.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.1} | {solve:.1} | {rendered:.2} | {reference:.0} |",
             recipe.name,
             bulk.points(),
             m.bulk.walks,
@@ -159,6 +160,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             100.0 * e.bias_standard_error.hypot(e.bias_noise),
             100.0 * e.rmse,
             100.0 * e.square_standard_error / (2.0 * e.rmse).max(e.square_standard_error.sqrt()),
+            100.0 * e.rmse_beyond_white,
             100.0 * e.systematic(),
             100.0 * e.noise,
             e.noise_db,

@@ -4,34 +4,24 @@
 //! Whoever is interrupted goes on: images that are there are not rendered again, and the bytes are the same in the end.
 //! Held-out images come from a solution with random numbers of its own, so that what training images have in common with
 //! each other they do not have in common with them.
+use crate::exposure::exposure;
 use crate::measure::{Measurement, bulk_options, lit};
 use crate::object::points_ply;
+use crate::plan::LIGHTS_PER_SOLUTION;
 use crate::{Object, Plan, PlannedView, Recipe, SynthError};
-use diamond_camera::Camera;
 use diamond_dataset::{
     BitDepth, CaptureDescription, CaptureInProgress, DatasetError, Geometry, Provenance, ShotDescription, Split,
     ViewDescription, encode_exr,
 };
 use diamond_image::{Mask, Transfer};
 use diamond_light::OlatLight;
-use diamond_pathtrace::{Bulk, BulkError, BulkOptions, BulkView, RepairReport};
+use diamond_pathtrace::{Bulk, BulkError, BulkView, RepairReport};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Lights that share a solution at most: bounds its memory.
-const LIGHTS_PER_SOLUTION: usize = 128;
-/// Seeds of held-out images, of the exposure and of points are the recipe's with these bits turned.
+/// The seed of held-out images is the recipe's with these bits turned.
 const HELD_OUT: u64 = 0x7465_7374;
-const EXPOSED: u64 = 0x6578_706f;
-/// Points and walks of the solution that finds the exposure.
-const EXPOSURE_EFFORT: (u32, u32) = (1000, 64);
-/// Views and largest side of its pictures.
-const EXPOSURE_VIEWS: usize = 4;
-const EXPOSURE_SIDE: u32 = 48;
-/// So many of the covered values are above [`BRIGHT`] after exposure.
-const BRIGHT_SHARE: f64 = 0.01;
-const BRIGHT: f32 = 0.9;
 
 /// What is being done, for progress bars.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,7 +62,6 @@ struct Job<'a> {
     recipe: &'a Recipe,
     plan: Plan,
     object: Object,
-    progress: &'a Progress<'a>,
 }
 
 /// Makes the capture `dir`, which must not exist; `folder` is where the recipe's paths are relative to.
@@ -87,12 +76,12 @@ pub fn synthesize(
 ) -> Result<CaptureRecord, SynthError> {
     let plan = Plan::new(recipe)?;
     let object = Object::new(recipe, folder)?;
-    let job = Job { recipe, plan, object, progress };
+    let job = Job { recipe, plan, object };
     let hash = recipe.hash();
     // Two meshes under one name are two captures.
     let identity = format!("{hash} {:?}", job.object.mesh.bounds());
     let capture = CaptureInProgress::open(dir, job.description(), &identity)?;
-    let exposure = job.exposure()?;
+    let exposure = exposure(recipe, &job.object, &job.plan, &|f| progress(Stage::Exposure, f))?;
     let (mut done, mut rendered, mut form) = (0, 0, "");
     let groups = job.plan.groups(LIGHTS_PER_SOLUTION);
     for (g, (views, lights)) in groups.iter().enumerate() {
@@ -117,8 +106,10 @@ pub fn synthesize(
     }
     let points = job.object.surface_points(recipe.film.points as usize, recipe.seed);
     capture.write_file("points3d.ply", &points_ply(&points))?;
-    let error =
-        if recipe.quality.measure { Some(job.measurement().run(&|f| progress(Stage::Measure, f))?) } else { None };
+    let error = match recipe.quality.measure {
+        true => Some(job.measurement(exposure).run(&|f| progress(Stage::Measure, f))?),
+        false => None,
+    };
     let record = CaptureRecord {
         recipe_hash: hash,
         exposure,
@@ -190,51 +181,17 @@ impl Job<'_> {
         Ok(capture.write_file(&geometry_name(view), &geometry.encode()?)?)
     }
 
-    /// What radiance is multiplied by.
-    fn exposure(&self) -> Result<f32, SynthError> {
-        if let Some(exposure) = self.recipe.film.exposure {
-            return Ok(exposure);
-        }
-        let all: Vec<&PlannedView> = self.plan.views.iter().filter(|v| v.split == Split::Train).collect();
-        let chosen = (0..EXPOSURE_VIEWS.min(all.len())).map(|k| all[k * all.len() / EXPOSURE_VIEWS.min(all.len())]);
-        let mut values = Vec::new();
-        for view in chosen {
-            let mut lights = view.lights.clone();
-            lights.sort_unstable();
-            lights.truncate(LIGHTS_PER_SOLUTION);
-            let (points, walks) = EXPOSURE_EFFORT;
-            let options = BulkOptions {
-                points,
-                walks,
-                samples_per_axis: 1,
-                ..bulk_options(self.recipe, self.recipe.seed ^ EXPOSED)
-            };
-            let scene = lit(self.recipe, &self.object, &self.plan, &lights);
-            let bulk = Bulk::solve(&scene, &options, &|f| (self.progress)(Stage::Exposure, f))?;
-            let picture = bulk.render(&resized(&view.camera, EXPOSURE_SIDE), self.recipe.seed)?;
-            for image in &picture.lights {
-                let covered = |(_, c): &(&[f32], &f32)| **c > 0.5;
-                let pixels = image.data().chunks_exact(3).zip(picture.coverage.data()).filter(covered);
-                values.extend(pixels.flat_map(|(v, _)| v.iter().copied()));
-            }
-        }
-        values.sort_by(f32::total_cmp);
-        let at = ((1.0 - BRIGHT_SHARE) * values.len() as f64) as usize;
-        let bright = values.get(at).copied().unwrap_or(BRIGHT);
-        // An object that is black stays black.
-        Ok(if bright > f32::MIN_POSITIVE { BRIGHT / bright } else { 1.0 })
-    }
-
-    fn measurement(&self) -> Measurement {
-        Measurement::new(self.recipe, &self.object, &self.plan)
+    fn measurement(&self, exposure: f32) -> Measurement {
+        Measurement::new(self.recipe, &self.object, &self.plan, 1.0 / exposure)
     }
 
     fn json(&self, record: &CaptureRecord) -> Value {
         let measured = record.error.map(|e| {
             json!({
                 "bias": e.bias, "bias_standard_error": e.bias_standard_error, "rmse": e.rmse,
+                "rmse_beyond_white": e.rmse_beyond_white,
                 "rmse_of_root_mean_square": e.rmse_of_rms, "noise": e.noise, "noise_db": e.noise_db,
-                "bias_noise": e.bias_noise, "systematic": e.systematic(), "against": self.measurement().describe(),
+                "bias_noise": e.bias_noise, "systematic": e.systematic(), "against": self.measurement(record.exposure).describe(),
             })
         });
         let lights: Vec<Value> =
@@ -265,17 +222,6 @@ fn split_name(view: &PlannedView) -> &'static str {
 
 fn geometry_name(view: &PlannedView) -> String {
     format!("geometry/{}_r_{}.exr", split_name(view), view.number)
-}
-
-/// The same view with `side` pixels along each side, at most as many as it has.
-fn resized(camera: &Camera, side: u32) -> Camera {
-    let k = &camera.intrinsics;
-    let scale = side.min(k.width) as f32 / k.width as f32;
-    let mut intrinsics = *k;
-    (intrinsics.fx, intrinsics.fy) = (k.fx * scale, k.fy * scale);
-    (intrinsics.cx, intrinsics.cy) = (k.cx * scale, k.cy * scale);
-    (intrinsics.width, intrinsics.height) = (side.min(k.width), side.min(k.height));
-    Camera { intrinsics, pose: camera.pose }
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@
 mod capture;
 mod changes;
 mod error;
+mod exposure;
 mod family;
 mod measure;
 mod object;
@@ -18,6 +19,7 @@ mod shards;
 pub use capture::{CaptureRecord, Progress, Stage, synthesize};
 pub use changes::changed_table;
 pub use error::SynthError;
+pub use exposure::exposure;
 pub use family::Family;
 pub use measure::Measurement;
 pub use object::Object;

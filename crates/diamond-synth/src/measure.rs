@@ -48,13 +48,16 @@ pub struct Measurement {
     pub cameras: Vec<Camera>,
     /// The capture's quality.
     pub bulk: BulkOptions,
+    /// Radiance at which photographs are white.
+    pub white: f32,
     /// The reference: as many paths as the recipe's `quality.measured_paths`.
     pub reference: ReferenceOptions,
 }
 
 impl Measurement {
-    /// Of a recipe and what was made of it: training views and lights that are spread over the rig.
-    pub fn new(recipe: &Recipe, object: &Object, plan: &Plan) -> Self {
+    /// Of a recipe and what was made of it: training views and lights that are spread over the rig. `white` is the radiance at which
+    /// photographs are white, one over the [`exposure`](crate::exposure()).
+    pub fn new(recipe: &Recipe, object: &Object, plan: &Plan, white: f32) -> Self {
         let spread = |n: usize, most: usize| (0..most.min(n)).map(move |k| k * n / most.min(n));
         let views: Vec<_> = plan.views.iter().filter(|v| v.split == Split::Train).collect();
         let cameras = spread(views.len(), MEASURED_VIEWS).map(|k| views[k].camera).collect();
@@ -65,6 +68,7 @@ impl Measurement {
             scene: lit(recipe, object, plan, &lights),
             cameras,
             bulk: bulk_options(recipe, recipe.seed),
+            white,
             reference: ReferenceOptions {
                 samples: recipe.quality.measured_paths,
                 seed: recipe.seed ^ MEASURED,
@@ -85,14 +89,15 @@ impl Measurement {
                 progress(f);
             }
         };
-        Ok(measure_bulk(&self.scene, &self.bulk, &self.cameras, &self.reference, &told)?)
+        Ok(measure_bulk(&self.scene, &self.bulk, &self.cameras, &self.reference, self.white, &told)?)
     }
 
     /// What was compared, in words.
     pub fn describe(&self) -> String {
         let side = self.cameras.first().map_or(0, |c| c.intrinsics.width);
         format!(
-            "unbiased reference, {} paths per pixel, {} lights, {} views of {side}²; relative to the mean radiance of covered pixels",
+            "unbiased reference, {} paths per pixel, {} lights, {} views of {side}²; relative to the mean radiance of covered pixels; \
+             rmse with values above white as white",
             self.reference.samples,
             self.scene.lights.len(),
             self.cameras.len(),

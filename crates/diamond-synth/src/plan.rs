@@ -5,6 +5,8 @@ use diamond_dataset::Split;
 use diamond_light::{LightRig, OlatLight};
 use glam::{Quat, Vec3};
 
+/// Lights that share a solution at most: bounds its memory.
+pub(crate) const LIGHTS_PER_SOLUTION: usize = 128;
 /// Turns held-out cameras and lights away from those of training, radians: no multiple of the golden angle is near it.
 const HELD_OUT_TURN: f32 = 1.0;
 

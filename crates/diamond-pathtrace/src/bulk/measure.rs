@@ -19,9 +19,13 @@ pub struct BulkError {
     /// What two solutions with half the walks differ by in the mean, halved: the size of the bulk solution's own part in `bias`
     /// (walks are shared by all pixels and lamps, so it does not average out over them).
     pub bias_noise: f64,
-    /// Root of the mean squared difference from the truth, over the mean radiance. The truth is known by two independent references, and the
-    /// product of the differences from both has no part of either's noise in the mean (0 where it is negative).
+    /// Root of the mean squared difference from the truth, over the mean radiance, where values above the film's white count as white. The
+    /// truth is known by two independent references, and the product of the differences from both has no part of either's noise in
+    /// the mean (0 where it is negative).
     pub rmse: f64,
+    /// The same without white's limit. A glint of a coat is hundreds of times as bright as the mean: one pixel that is off by a hundredth of it can be
+    /// more than everything else together.
+    pub rmse_beyond_white: f64,
     /// Standard error of the square of `rmse`, pixels taken as independent.
     pub square_standard_error: f64,
     /// The same over the root mean square of the reference.
@@ -151,16 +155,18 @@ pub fn reference_pairs(
 }
 
 /// Solves and renders `cameras` in bulk and by [`reference_pairs`], and compares; two more solutions with half the walks and other
-/// seeds measure the noise, each half as good as the whole in variance.
+/// seeds measure the noise, each half as good as the whole in variance. `white` is the radiance that the film shows as white, infinite
+/// where it holds everything.
 pub fn measure_bulk(
     scene: &Scene,
     options: &BulkOptions,
     cameras: &[Camera],
     reference: &ReferenceOptions,
+    white: f32,
     progress: &(dyn Fn(f32) + Sync),
 ) -> Result<BulkError, PathtraceError> {
     let references = reference_pairs(scene, cameras, reference)?;
-    BulkError::against(scene, options, cameras, &references, progress)
+    BulkError::against(scene, options, cameras, &references, white, progress)
 }
 
 impl BulkError {
@@ -170,6 +176,7 @@ impl BulkError {
         options: &BulkOptions,
         cameras: &[Camera],
         references: &[ReferencePair],
+        white: f32,
         progress: &(dyn Fn(f32) + Sync),
     ) -> Result<Self, PathtraceError> {
         checked(cameras, references)?;
@@ -177,7 +184,7 @@ impl BulkError {
         let whole = Bulk::solve(scene, options, &|f| progress(f * 0.5))?;
         let first = Bulk::solve(scene, &halved(options.seed.wrapping_add(1)), &|f| progress(0.5 + f * 0.25))?;
         let second = Bulk::solve(scene, &halved(options.seed.wrapping_add(2)), &|f| progress(0.75 + f * 0.25))?;
-        Self::between(&whole, [&first, &second], cameras, references)
+        Self::between(&whole, [&first, &second], cameras, references, white)
     }
 
     /// The same for solutions that are at hand: the whole, and two independent ones with half its walks.
@@ -189,8 +196,11 @@ impl BulkError {
         [first, second]: [&Bulk<'_>; 2],
         cameras: &[Camera],
         references: &[ReferencePair],
+        white: f32,
     ) -> Result<Self, PathtraceError> {
         checked(cameras, references)?;
+        let white = f64::from(white);
+        let mut unlimited = 0.0f64;
         let (mut sum, mut reference_sum, mut reference_square) = (0.0f64, 0.0f64, 0.0f64);
         let (mut squares, mut noise, mut relative, mut n) = (0.0f64, 0.0f64, 0.0f64, 0usize);
         // Of a pixel's squared differences, all lamps and channels together.
@@ -220,8 +230,11 @@ impl BulkError {
                         sum += x;
                         reference_sum += r;
                         reference_square += p * q;
-                        squares += (x - p) * (x - q);
-                        pixel_square[i] += (x - p) * (x - q);
+                        unlimited += (x - p) * (x - q);
+                        let shown = x.min(white);
+                        let square = (shown - p.min(white)) * (shown - q.min(white));
+                        squares += square;
+                        pixel_square[i] += square;
                         pixel_error[i] += e;
                         apart += half;
                         // Var(a − b) = 2·Var(half) = 4·Var(whole).
@@ -246,6 +259,7 @@ impl BulkError {
             bias_standard_error: spread.sqrt() / reference_sum.max(1e-30),
             bias_noise: 0.5 * apart.abs() / reference_sum.max(1e-30),
             rmse: error / mean,
+            rmse_beyond_white: (unlimited / n).max(0.0).sqrt() / mean,
             square_standard_error: pixel_squares.sqrt() / (n * mean * mean),
             rmse_of_rms: error / rms,
             noise: (noise / n).sqrt() / mean,
