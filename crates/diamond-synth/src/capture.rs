@@ -238,6 +238,7 @@ mod tests {
             object = { kind = "solids", cells = 16, parts = [{ solid = "sphere", centre = [0, 0, 0], radius = 0.8 }] }
             material = { sigma_t = [6, 8, 12], albedo = [0.98, 0.9, 0.7] }
             rig = { views = 2, lights = 2 }
+            held_out = { views = 1, seen_lights = 1, unseen_lights = 1 }
             film = { resolution = 12 }
             quality = { points = 120, walks = 16, samples_per_axis = 2 }
         "#;
