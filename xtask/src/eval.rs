@@ -294,6 +294,18 @@ mod tests {
         assert_eq!(method["loss"]["depth_consistency"].as_float(), Some(0.3));
     }
 
+    /// The files that are shipped are read, and name captures that are here.
+    #[test]
+    fn shipped_evaluations_are_read() {
+        let root = crate::tidy::workspace_root();
+        for (name, methods) in [("consistency", 7), ("consistency-why", 11), ("regimes", 3)] {
+            let text = std::fs::read_to_string(root.join(format!("assets/eval/{name}.toml"))).unwrap();
+            let grid = Grid::parse(&text).unwrap();
+            assert_eq!(grid.methods.len(), methods, "{name}");
+            assert!(grid.objects.iter().all(|(_, folder)| root.join(folder).is_dir()), "{name}");
+        }
+    }
+
     #[test]
     fn mistakes_are_named() {
         let error = |from: &str, to: &str| Grid::parse(&FILE.replace(from, to)).unwrap_err();

@@ -368,6 +368,17 @@ mod tests {
     }
 
     #[test]
+    fn the_shipped_search_is_read() {
+        let root = crate::tidy::workspace_root();
+        let text = std::fs::read_to_string(root.join("assets/eval/tune-consistency.toml")).unwrap();
+        let mut search = Search::parse(&text).unwrap();
+        search.capture = root.join(&search.capture);
+        let selection = search.selection().unwrap();
+        let images = |views: &[diamond_dataset::ManifestView]| views.iter().map(|v| v.images.len()).sum::<usize>();
+        assert_eq!((images(&selection.train), images(&selection.test)), (9, 24));
+    }
+
+    #[test]
     fn mistakes_are_named() {
         let error = |from: &str, to: &str| Search::parse(&FILE.replace(from, to)).unwrap_err();
         let mut full = Search::parse(&FILE.replace("\"5x5\"", "\"full-full\"").replace("views", "rest")).unwrap();
