@@ -17,6 +17,7 @@ mod image;
 mod luminance;
 mod mask;
 mod morphology;
+mod outline_distance;
 mod remap;
 mod resize;
 mod transfer;

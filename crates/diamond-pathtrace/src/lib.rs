@@ -43,6 +43,7 @@ mod mesh;
 mod mesh_geometry;
 mod noise;
 mod obj;
+mod patches;
 mod path;
 mod ply;
 mod polygonise;
@@ -69,6 +70,7 @@ pub use medium::{Flight, FreeFlight, MAX_MEAN_COSINE, Medium, henyey_greenstein,
 pub use mesh::{MAX_COORDINATE, Mesh};
 pub use mesh_geometry::MeshGeometry;
 pub use obj::{parse_obj, read_obj};
+pub use patches::Patch;
 pub use path::{PathEnd, PathOptions, Tracer};
 pub use ply::{parse_ply, read_ply};
 pub use polygonise::polygonise;

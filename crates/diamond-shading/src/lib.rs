@@ -7,6 +7,9 @@
 //! [`GBuffer`], and [`ShadePullback::pull`] takes an image gradient back to those channels. Beside them stand the visibility
 //! of a point as spherical harmonics ([`sh_visibility`]) and the normals that a depth map implies ([`pseudo_normals`]).
 //!
+//! What physics says of the subsurface part without learning is [`SurfelTransport`]: a [`RadialProfile`] carries light between
+//! points of the surface, and its few weights are fitted to photographs by [`NormalEquations`].
+//!
 //! Invariant: nothing here knows of Gaussians, of how the features were blended, of files or of optimisers. Every function is
 //! deterministic, with the same bits on any number of threads. Directions are unit vectors that point away from the surface;
 //! radiance is linear RGB; α is the square of the roughness. Gradients with respect to unit vectors are those of free
@@ -50,6 +53,7 @@ mod deferred;
 mod encoding;
 mod error;
 mod fresnel;
+mod gaussian_sum;
 pub mod gbuffer;
 pub mod ggx;
 mod incidence;
@@ -57,11 +61,14 @@ mod many_lights;
 mod material;
 mod mlp;
 mod mlp_chunk;
+mod normal_equations;
+mod normalized_diffusion;
 mod number;
 mod pixel_block;
 mod pixels;
 mod prepared;
 mod pseudo_normal;
+mod radial_profile;
 mod residual;
 mod row_blocks;
 mod row_chunks;
@@ -69,6 +76,8 @@ pub mod sh_visibility;
 mod shaded;
 mod simd;
 mod surface_point;
+mod surfel_irradiance;
+mod surfel_transport;
 mod transfer;
 mod vector;
 
@@ -83,14 +92,20 @@ pub use encoding::{
 };
 pub use error::ShadingError;
 pub use fresnel::Fresnel;
+pub use gaussian_sum::GAUSSIAN_SUM_TOLERANCE;
 pub use gbuffer::{GBuffer, GBufferGrad, MIN_OPACITY, channel};
 pub use ggx::Masking;
 pub use many_lights::{LightChannels, LitRows, ManyLights};
 pub use material::{DIELECTRIC_F0, MIN_ROUGHNESS, Material, MaterialGrad};
 pub use mlp::{Activation, CHUNK_ROWS, GRADIENT_GROUPS, Mlp, MlpGrad, MlpPullback, MlpShape};
+pub use normal_equations::{NormalEquations, SolveOptions};
+pub use normalized_diffusion::{MIN_DIFFUSION_LENGTH, NormalizedDiffusion, NormalizedDiffusionGrad};
 pub use prepared::{Prepared, TransportChannels};
 pub use pseudo_normal::{MIN_COVERAGE, PseudoNormalPullback, pseudo_normals};
+pub use radial_profile::{RadialProfile, RadialProfileGrad, plane_gaussian, plane_gaussian_pull};
 pub use residual::{ResidualNetwork, ResidualNetworkConfig, ResidualNetworkGrad, ResidualOutput, ResidualPullback};
 pub use shaded::{Shaded, ShadedGrad, ShadedMaps, ShadedMapsGrad};
 pub use surface_point::{MIN_COS_THETA_O, MIN_NORMAL_LENGTH};
+pub use surfel_irradiance::{Entry, SurfelLighting, SurfelLightingGrad};
+pub use surfel_transport::{Balance, ExitanceGrad, ExitancePullback, Receivers, SurfelTransport, Surfels};
 pub use transfer::{TransferActivation, TransferConfig, TransferGrad, TransferPullback, transfer_radiance};

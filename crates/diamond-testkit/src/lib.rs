@@ -15,6 +15,7 @@ pub mod pseudo_normal;
 mod real;
 pub mod splat;
 pub mod strategies;
+pub mod surfel_transport;
 pub mod visibility;
 
 pub use real::{Dual, Real, gradient, jvp, vjp};
