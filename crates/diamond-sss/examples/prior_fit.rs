@@ -4,7 +4,8 @@
 //!
 //! `MESH` is an OBJ or PLY file in the capture's frame (`up=y` turns y upward into z upward); `hull` carves the masks of the training views. Keys: `fits` (regimes, comma between: `1x1,3x3,full-one`),
 //! `hull` (regime whose masks carve; default all views), `hull_resolution`, `surfels`, `widths`, `narrowest` (in mean distances of surfels), `widest` (in
-//! radii of the object), `balance=conserving|plain`, `samples` (per axis of a pixel), `weighting=display|linear`, `entry=full|fresnel`, `coat=1|0`,
+//! radii of the object), `balance=plain|conserving`, `samples` (per axis of a pixel), `weighting=display|linear`, `entry=full|fresnel`, `exposure` (factor of the photographs, so that
+//! reflectances are true ones), `coat=1|0`,
 //! `local=1|0` (light that leaves where it enters), `seed`, `out` (folder for pictures: photograph, prior, five times the difference).
 //!
 //! Unknowns: per channel a weight ≥ 0 for each Gaussian and for local light, and a scale ≥ 0 of a GGX coat (F0 0.04) at three roughnesses. Rows are weighted by the
@@ -65,7 +66,10 @@ fn hull(capture: &Capture, resolution: u32) -> Result<Mesh, Failure> {
             most.max(d[0] * z / camera.intrinsics.fx)
         })
     };
-    Ok(polygonise(distance, scene.centre - reach, scene.centre + reach, resolution)?.with_smooth_normals())
+    // A coarse one first, to know where the grid should be.
+    let (low, high) = polygonise(distance, scene.centre - reach, scene.centre + reach, 48)?.bounds();
+    let margin = Vec3::splat(reach.x / 24.0);
+    Ok(polygonise(distance, low - margin, high + margin, resolution)?.with_smooth_normals())
 }
 
 /// What is needed to predict images: geometry, transport, and settings.
@@ -78,6 +82,7 @@ struct Prior {
     samples: u32,
     coats: usize,
     local: bool,
+    exposure: f32,
 }
 
 /// One image: for each pixel that shows the object its features, and the photograph.
@@ -172,7 +177,7 @@ impl Prior {
             out.push(Features {
                 pixels: pixels.clone(),
                 values,
-                intensity: intensity(&shot.light),
+                intensity: intensity(&shot.light) * self.exposure,
                 radiance: observation.radiance.clone(),
                 display: observation.display.clone(),
                 name: shot.name.clone(),
@@ -369,9 +374,9 @@ fn main() -> Result<(), Failure> {
         settings.number("widest", 1.0)? * radius,
         settings.number("widths", 14.0)? as usize,
     );
-    let balance = match settings.text("balance", "conserving").as_str() {
-        "plain" => Balance::Plain,
-        _ => Balance::Conserving,
+    let balance = match settings.text("balance", "plain").as_str() {
+        "conserving" => Balance::Conserving,
+        _ => Balance::Plain,
     };
     let surfels = Surfels {
         positions: patches.iter().map(|p| p.position).collect(),
@@ -394,6 +399,7 @@ fn main() -> Result<(), Failure> {
         samples: settings.number("samples", 2.0)? as u32,
         coats: if settings.number("coat", 1.0)? > 0.0 { COATS.len() } else { 0 },
         local: settings.number("local", 1.0)? > 0.0,
+        exposure: settings.number("exposure", 1.0)?,
     };
     let start = Instant::now();
     let mut test = Vec::new();
