@@ -53,9 +53,11 @@ fn hull(capture: &Capture, resolution: u32) -> Result<Mesh, Failure> {
         views.push((view.camera, mask.outline_distance()));
     }
     let scene = capture.scene();
-    let reach = Vec3::splat(1.5 * scene.framed_radius);
+    // All cameras see all of the ball that they frame, and nobody carves what is beyond.
+    let reach = Vec3::splat(scene.framed_radius);
     let distance = |p: Vec3| {
-        views.iter().fold(f32::NEG_INFINITY, |most, (camera, outline)| {
+        let beyond = p.distance(scene.centre) - scene.framed_radius;
+        views.iter().fold(beyond, |most, (camera, outline)| {
             let Some((pixel, z)) = camera.project(p) else { return most };
             let size = Vec2::new(outline.width() as f32, outline.height() as f32);
             if !(pixel.cmpge(Vec2::ZERO).all() && pixel.cmple(size).all()) {
@@ -271,7 +273,7 @@ fn seen(geometry: &Geometry, camera: &Camera, per_axis: u32) -> Vec<Sample> {
     each.collect()
 }
 
-/// Mean PSNR under seen and unseen lights.
+/// Mean PSNR under seen and unseen lights; NaN where there are none.
 fn score(prior: &Prior, test: &[(Features, OlatLight)], fitted: &Capture, x: &[f64]) -> Result<[f64; 2], Failure> {
     let (mut sums, mut counts) = ([0.0; 2], [0usize; 2]);
     for (image, light) in test {
@@ -283,7 +285,7 @@ fn score(prior: &Prior, test: &[(Features, OlatLight)], fitted: &Capture, x: &[f
         sums[k] += psnr(&render, &truth, 1.0)?;
         counts[k] += 1;
     }
-    Ok([sums[0] / counts[0].max(1) as f64, sums[1] / counts[1].max(1) as f64])
+    Ok([sums[0] / counts[0] as f64, sums[1] / counts[1] as f64])
 }
 
 /// The two-parameter profile that fits the same equations best, the rest as in `x`: a search in albedo and mean free path per channel.
