@@ -2,7 +2,7 @@
 //!
 //! Each cell of the grid is one `diamond reconstruct` into a folder of its own, and done when its `metrics.json` is there. So a
 //! grid can be interrupted and goes on where it was, cells run on any machine that has the captures (`--print`, `--shard`), and
-//! the tables are made of whatever is done, saying what is not: `eval.md`, `eval.html` with a plot of all runs, and `eval.csv` with a
+//! the tables are made of whatever is done, saying what is not: `eval.md`, `eval.html` with a plot of all runs and pictures side by side, and `eval.csv` with a
 //! row per run, its revision, and hashes of its capture and of the images that it learned from and was measured on.
 //!
 //! ```toml
@@ -19,6 +19,7 @@
 //! ```
 mod figures;
 pub(crate) mod page;
+mod pictures;
 mod tables;
 
 pub use figures::{Better, Figures, MEASURES, Measure, csv, figures_in};
@@ -304,6 +305,11 @@ mod tests {
             assert_eq!(grid.methods.len(), methods, "{name}");
             assert!(grid.objects.iter().all(|(_, folder)| root.join(folder).is_dir()), "{name}");
         }
+        // Of captures that are made first.
+        for (name, methods) in [("consistency-full", 4), ("regimes-jade", 1)] {
+            let text = std::fs::read_to_string(root.join(format!("assets/eval/{name}.toml"))).unwrap();
+            assert_eq!(Grid::parse(&text).unwrap().methods.len(), methods, "{name}");
+        }
     }
 
     #[test]
@@ -385,6 +391,39 @@ mod tests {
             let page = grid.html(&half(&grid)[..few]);
             assert!(page.contains("</html>") && !page.contains("NaN") && !page.contains("inf"), "{page}");
         }
+    }
+
+    #[test]
+    fn pictures_of_all_methods_stand_side_by_side() {
+        let root = std::env::temp_dir().join(format!("diamond-xtask-eval-pictures-{}", std::process::id()));
+        let mut grid = Grid::parse(FILE).unwrap();
+        grid.output = root.clone();
+        let done = half(&grid);
+        assert!(grid.pictures(&done).is_empty());
+        for (k, (cell, _)) in done.iter().enumerate() {
+            std::fs::create_dir_all(cell.folder.join("images")).unwrap();
+            // The second method has one image more, and the last run one that is no picture.
+            for name in ["a", "b", "c"].iter().take(2 + k % 2) {
+                for kind in ["truth", "render", "flip"] {
+                    let path = cell.folder.join(format!("images/{name}_{kind}.png"));
+                    image::RgbImage::from_pixel(400, 200, image::Rgb([k as u8, 9, 9])).save(path).unwrap();
+                }
+            }
+            let metrics = r#"{"psnr": 1, "per_image": [{"name": "a", "psnr": 23.456}]}"#;
+            write(&cell.folder.join("metrics.json"), metrics).unwrap();
+        }
+        let text = grid.pictures(&done);
+        assert!(text.contains("spot, 3x3: a<") && text.contains("spot, 3x3: b<") && !text.contains("3x3: c"), "{text}");
+        // Two images: the photograph, and two pictures for each of two methods, made smaller.
+        assert_eq!(text.matches("<img").count(), 2 * (1 + 2 * 2));
+        assert_eq!(text.matches(": 23.46 dB").count(), 2);
+        let first = text.split("base64,").nth(1).unwrap().split('"').next().unwrap();
+        let png = base64::Engine::decode(&base64::engine::general_purpose::STANDARD, first).unwrap();
+        let picture = image::load_from_memory(&png).unwrap();
+        assert_eq!((picture.width(), picture.height()), (160, 80));
+        write(&done[0].0.folder.join("images/a_truth.png"), "no picture").unwrap();
+        assert!(grid.html(&done).contains("not readable"));
+        std::fs::remove_dir_all(root).unwrap();
     }
 
     #[test]

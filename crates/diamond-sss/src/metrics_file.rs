@@ -317,11 +317,20 @@ pub fn evaluate_folder(
 }
 
 fn save(folder: &Path, compared: &Compared<'_>) -> Result<(), SssError> {
-    let (width, height) = (compared.flip.width(), compared.flip.height());
-    let heat = heat_bytes(compared.flip, 1.0);
-    for (kind, bytes) in [("render", compared.render), ("truth", compared.truth), ("flip", &heat)] {
-        let path = folder.join("images").join(format!("{}_{kind}.png", compared.score.name));
-        write_output(&path, &encode_png_rgb(bytes, width, height)?)?;
+    save_images(folder, &compared.score.name, [compared.render, compared.truth], compared.flip)
+}
+
+/// Writes `images/{name}_{render,truth,flip}.png` below `folder`: render and photograph as display bytes, and the map of their FLIP.
+pub(crate) fn save_images(
+    folder: &Path,
+    name: &str,
+    [render, truth]: [&[u8]; 2],
+    flip: &diamond_image::Image,
+) -> Result<(), SssError> {
+    let heat = heat_bytes(flip, 1.0);
+    for (kind, bytes) in [("render", render), ("truth", truth), ("flip", &heat)] {
+        let path = folder.join("images").join(format!("{name}_{kind}.png"));
+        write_output(&path, &encode_png_rgb(bytes, flip.width(), flip.height())?)?;
     }
     Ok(())
 }

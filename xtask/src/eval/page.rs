@@ -17,7 +17,8 @@ h1,h2,h3{line-height:1.2}h2{margin-top:2.5rem}.quiet{color:#555}.wide{overflow-x
 table{border-collapse:collapse;margin:.5rem 0 1.5rem;font-variant-numeric:tabular-nums}\
 th,td{padding:.3rem .7rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}\
 th:first-child,td:first-child{text-align:left}thead th{border-bottom:2px solid #999}\
-td.best{font-weight:700;background:#eef6ee}svg{max-width:100%;height:auto}svg text{font:12px system-ui,sans-serif;fill:#333}";
+td.best{font-weight:700;background:#eef6ee}svg{max-width:100%;height:auto}svg text{font:12px system-ui,sans-serif;fill:#333}\
+.pictures{display:flex;gap:.6rem}figure{margin:0}img{display:block}figcaption{font-size:12px;max-width:160px}";
 
 /// Text for HTML.
 pub fn escape(text: &str) -> String {
@@ -133,6 +134,7 @@ impl Grid {
                 let _ = write!(body, "<h3>{}</h3>{dots}", escape(object));
             }
         }
+        body += &self.pictures(done);
         body += "<h2>Captures and revisions</h2><div class=\"wide\"><table><thead><tr><th>object</th><th>folder</th>\
                  <th>hash</th><th>revisions of its runs</th></tr></thead><tbody>";
         for (object, folder) in &self.objects {

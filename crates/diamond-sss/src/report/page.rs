@@ -2,6 +2,7 @@
 use super::chart::{chart, smooth};
 use super::light_control::light_control;
 use super::maps::{data_uri, map_pictures};
+use crate::metrics_file::save_images;
 use crate::picture::{encode_png_linear, encode_png_rgb, heat_bytes};
 use crate::{AtOnce, Metrics, RunRecord, SssError, TrainingLog, render_lights, write_output};
 use diamond_dataset::{Capture, Shot, View};
@@ -20,7 +21,8 @@ fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// Writes `report.html` in the run's folder: self-contained, opens without a network.
+/// Writes `report.html` in the run's folder: self-contained, opens without a network. The held-out images that it shows go to
+/// `images/` beside it, as `diamond evaluate --save-images` writes all of them.
 pub fn write_report(
     folder: &Path,
     model: &Model,
@@ -37,7 +39,7 @@ pub fn write_report(
     let rig = rig_for(capture, view);
     let control = light_control(model, at_once, &view.camera, &rig)?;
     body += include_str!("light_control.html");
-    body += &comparisons(model, at_once, capture, views, held_out)?;
+    body += &comparisons(folder, model, at_once, capture, views, held_out)?;
     body += "<section><h2>Course of the run</h2><div class=\"charts\">";
     let curve = |f: &dyn Fn(&crate::LogRow) -> f64| -> Vec<(f64, f64)> {
         smooth(&log.rows.iter().map(|r| (r.step as f64, f(r))).collect::<Vec<_>>(), CURVE_POINTS)
@@ -128,6 +130,7 @@ fn spread(views: &[View]) -> Vec<(&View, Vec<&Shot>)> {
 }
 
 fn comparisons(
+    folder: &Path,
     model: &Model,
     at_once: &AtOnce,
     capture: &Capture,
@@ -155,6 +158,7 @@ fn comparisons(
             let flip = flip_ldr(&a, &b, FlipOptions::default())?;
             let psnr = diamond_metrics::psnr(&a, &b, 1.0)?.min(crate::PSNR_CAP);
             let seen = if capture.is_seen_light(&shot.light) { "seen light" } else { "unseen light" };
+            save_images(folder, &shot.name, [&render, &observation.display], &flip.map)?;
             let picture = |png: Vec<u8>, caption: &str| {
                 format!(
                     "<figure><img alt=\"{caption}\" src=\"{}\"><figcaption>{caption}</figcaption></figure>",
