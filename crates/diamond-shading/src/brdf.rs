@@ -215,6 +215,9 @@ impl BrdfModel {
         facing: &Facing<T>,
         irradiance: Vector<T>,
     ) -> Vector<T> {
+        if floor.turned_away(facing) {
+            return Vector::same(facing.normal.x, Vec3::ZERO);
+        }
         let (angles, lit) = floor.raise(AnglesOf::new(facing.normal, facing.view, facing.light));
         (irradiance * self.evaluate_of(material, &angles) * angles.cos_theta_i).only_where(lit)
     }
@@ -248,6 +251,12 @@ impl BrdfModel {
         d_out: Vector<T>,
     ) -> (Vector<T>, ReflectGradOf<T>) {
         let (n, v, l) = (facing.normal, facing.view, facing.light);
+        if floor.turned_away(facing) {
+            let (zero, none) = (n.x.same(0.0), Vector::same(n.x, Vec3::ZERO));
+            let material = Surface { base_color: none, roughness: zero, metalness: zero };
+            let directions = DirectionsGradOf { normal: none, view: none, light: none };
+            return (none, ReflectGradOf { material, directions, irradiance: none });
+        }
         let free = AnglesOf::new(n, v, l);
         let (angles, lit) = floor.raise(free);
         let f = self.evaluate_of(material, &angles);
@@ -278,6 +287,13 @@ pub(crate) struct ReflectGradOf<T> {
 }
 
 impl CosineFloor {
+    /// Whether the light is behind the surface in every lane by more than rounding, so that nothing is reflected and nothing need
+    /// be computed. With a floor there is always something.
+    #[inline(always)]
+    fn turned_away<T: Number>(&self, facing: &Facing<T>) -> bool {
+        self.light < MIN_COSINE && T::everywhere(facing.normal.dot(facing.light).under(-TURNED_AWAY))
+    }
+
     /// The angles with both cosines raised, and where both are positive; elsewhere they are 1.
     #[inline(always)]
     fn raise<T: Number>(&self, angles: AnglesOf<T>) -> (AnglesOf<T>, T::Mask) {
@@ -290,6 +306,9 @@ impl CosineFloor {
         (AnglesOf { cos_theta_i, cos_theta_o, ..angles }, lit)
     }
 }
+
+/// n·l in `f32` is off by a few units of the last place: below minus this it is negative.
+const TURNED_AWAY: f32 = 1e-5;
 
 /// Cosines count as positive from here on: the reciprocal of a subnormal one is infinite.
 const MIN_COSINE: f32 = f32::MIN_POSITIVE;

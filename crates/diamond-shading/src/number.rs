@@ -43,6 +43,8 @@ pub(crate) trait Number:
     fn under(self, b: f32) -> Self::Mask;
     /// `self` where the mask is true, else `other`.
     fn or_where_not(self, mask: Self::Mask, other: Self) -> Self;
+    /// Whether the mask is true in every lane.
+    fn everywhere(mask: Self::Mask) -> bool;
     /// e^self to 2 ulp.
     fn exp(self) -> Self;
     /// A scalar formula without branches on each lane: for what is done in `f64`. Its loop over the lanes becomes vector
@@ -117,6 +119,10 @@ impl Number for f32 {
         if mask { self } else { other }
     }
     #[inline(always)]
+    fn everywhere(mask: bool) -> bool {
+        mask
+    }
+    #[inline(always)]
     fn exp(self) -> f32 {
         diamond_simd::exp(Lanes::new(Scalar::new(), self)).v
     }
@@ -159,6 +165,10 @@ impl<S: Simd> Number for Lanes<S> {
     #[inline(always)]
     fn or_where_not(self, mask: Mask<S>, other: Self) -> Self {
         mask.select(self, other)
+    }
+    #[inline(always)]
+    fn everywhere(mask: Mask<S>) -> bool {
+        !(!mask).any()
     }
     #[inline(always)]
     fn exp(self) -> Self {
