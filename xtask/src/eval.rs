@@ -306,7 +306,7 @@ mod tests {
             assert!(grid.objects.iter().all(|(_, folder)| root.join(folder).is_dir()), "{name}");
         }
         // Of captures that are made first.
-        for (name, methods) in [("consistency-full", 4), ("regimes-jade", 1)] {
+        for (name, methods) in [("consistency-full", 4), ("consistency-hull", 5), ("regimes-full", 1)] {
             let text = std::fs::read_to_string(root.join(format!("assets/eval/{name}.toml"))).unwrap();
             assert_eq!(Grid::parse(&text).unwrap().methods.len(), methods, "{name}");
         }
