@@ -72,7 +72,7 @@ impl Default for BulkOptions {
     fn default() -> Self {
         Self {
             points: 3000,
-            walks: 8192,
+            walks: 16384,
             visibility: 256,
             connections: 0.3,
             samples_per_axis: 4,
