@@ -180,6 +180,33 @@ pub fn read_ply(path: &Path) -> Result<Mesh, PathtraceError> {
     parse_ply(&bytes).map_err(problem)
 }
 
+impl Mesh {
+    /// The bytes of a binary PLY file with positions, normals where there are any, and triangles; [`parse_ply`] gives the same numbers back
+    /// (normals to rounding, since they are made unit length).
+    pub fn to_ply(&self) -> Vec<u8> {
+        let normals = self.normals.as_ref().filter(|n| n.len() == self.positions.len());
+        let mut header = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n",
+            self.positions.len()
+        );
+        if normals.is_some() {
+            header.push_str("property float nx\nproperty float ny\nproperty float nz\n");
+        }
+        let faces = self.triangles.len();
+        header.push_str(&format!("element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"));
+        let mut bytes = header.into_bytes();
+        for (i, p) in self.positions.iter().enumerate() {
+            let normal = normals.map(|n| n[i].to_array());
+            p.to_array().iter().chain(normal.iter().flatten()).for_each(|v| bytes.extend(v.to_le_bytes()));
+        }
+        for triangle in &self.triangles {
+            bytes.push(3);
+            triangle.iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+        }
+        bytes
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -203,6 +230,17 @@ mod tests {
             assert_eq!(parse_ply(&bytes).unwrap(), mesh);
             assert!(parse_ply(&bytes[..bytes.len() - 1]).unwrap_err().contains("ends too early"));
         }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let mesh = parse_ply(SQUARE.as_bytes()).unwrap();
+        assert_eq!(parse_ply(&mesh.to_ply()).unwrap(), mesh);
+        let ball = Mesh::icosphere(Vec3::ONE, 0.7, 2).with_smooth_normals();
+        let again = parse_ply(&ball.to_ply()).unwrap();
+        assert_eq!((&again.positions, &again.triangles), (&ball.positions, &ball.triangles));
+        let pairs = again.normals.iter().flatten().zip(ball.normals.iter().flatten());
+        assert!(pairs.clone().count() > 0 && pairs.clone().all(|(a, b)| a.distance(*b) < 1e-6));
     }
 
     #[test]

@@ -51,6 +51,9 @@ pub struct Config {
     pub shading: Shading,
     /// Subsurface residual.
     pub residual: Residual,
+    /// Light through the object.
+    #[serde(default)]
+    pub subsurface: Subsurface,
     /// Ray-traced visibility.
     pub visibility: Visibility,
     /// Weights of the objective.
@@ -459,6 +462,99 @@ pub struct Residual {
     pub transfer_smoothness: f32,
 }
 
+/// What carries light through the object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub enum SubsurfaceModel {
+    /// The network and the transfer vectors of `[residual]` alone.
+    #[default]
+    #[serde(rename = "mlp")]
+    Mlp,
+    /// A homogeneous medium by a radial profile.
+    #[serde(rename = "profile")]
+    Profile,
+    /// A homogeneous medium by random walks.
+    #[serde(rename = "walk")]
+    Walk,
+    /// A profile, and `[residual]` for what it leaves.
+    #[serde(rename = "profile+mlp")]
+    ProfileMlp,
+    /// Random walks, and `[residual]` for what they leave.
+    #[serde(rename = "walk+mlp")]
+    WalkMlp,
+}
+
+impl SubsurfaceModel {
+    /// Whether a medium is fitted.
+    pub fn has_medium(self) -> bool {
+        self != SubsurfaceModel::Mlp
+    }
+
+    /// Whether light is carried by random walks.
+    pub fn walks(self) -> bool {
+        matches!(self, SubsurfaceModel::Walk | SubsurfaceModel::WalkMlp)
+    }
+
+    /// Whether `[residual]` adds to it.
+    pub fn has_residual(self) -> bool {
+        !matches!(self, SubsurfaceModel::Profile | SubsurfaceModel::Walk)
+    }
+}
+
+/// Light through the object.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Subsurface {
+    /// What carries it.
+    pub model: SubsurfaceModel,
+    /// Fraction of the run after which surface and medium are first fitted.
+    pub from: f32,
+    /// Fractions of the run after which they are fitted again, ascending.
+    pub refit: Vec<f32>,
+    /// Cells of the surface along the longest side of the object.
+    pub resolution: u32,
+    /// Standard deviation of a point's weight in the surface, cells.
+    pub smoothing: f32,
+    /// Surfels between which light is carried, about.
+    pub surfels: usize,
+    /// Gaussians of a profile.
+    pub widths: usize,
+    /// When the first medium comes in, replace the Gaussians by about so many on the surface; 0 keeps them.
+    pub seeds: usize,
+    /// Factor on the learning rates of shape (means, covariances, opacities) once there is a medium.
+    pub shape_rate: f32,
+    /// Factor on the learning rate of normals once there is a medium.
+    pub normal_rate: f32,
+    /// How far the first Gaussians lie under the surface, their standard deviations.
+    pub inset: f32,
+    /// Their standard deviation along the surface, widths of the piece that each stands for.
+    pub seed_width: f32,
+    /// Factor on the learning rates of materials, tints among them, once there is a medium.
+    pub material_rate: f32,
+    /// Pull of what the network adds toward nothing.
+    pub residual_weight: f32,
+}
+
+impl Default for Subsurface {
+    fn default() -> Self {
+        Self {
+            model: SubsurfaceModel::Mlp,
+            from: 0.15,
+            refit: vec![0.4, 0.7],
+            resolution: 80,
+            smoothing: 1.0,
+            surfels: 6000,
+            widths: 12,
+            seeds: 6000,
+            shape_rate: 1.0,
+            normal_rate: 1.0,
+            inset: 0.0,
+            seed_width: 0.6,
+            material_rate: 1.0,
+            residual_weight: 0.0,
+        }
+    }
+}
+
 /// Ray-traced visibility.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -760,9 +856,13 @@ impl Config {
             let detail = format!("`{key}` must be a finite number");
             return Err(ReconstructError::Config { origin: origin.into(), detail });
         }
-        let config: Config = toml::Value::Table(table)
+        let mut config: Config = toml::Value::Table(table)
             .try_into()
             .map_err(|e: toml::de::Error| ReconstructError::Config { origin: origin.into(), detail: brief(e) })?;
+        if !config.subsurface.model.has_residual() {
+            config.residual.network = false;
+            config.residual.transfer = false;
+        }
         config.validate(origin)?;
         Ok(config)
     }
@@ -787,6 +887,23 @@ impl Config {
     /// Checks ranges; `origin` names the file in errors.
     pub fn validate(&self, origin: &str) -> Result<(), ReconstructError> {
         let fail = |detail: String| Err(ReconstructError::Config { origin: origin.to_owned(), detail });
+        let medium = &self.subsurface;
+        if medium.model.has_medium() {
+            if self.shading.incident == IncidentVariant::Learned || !self.residual.scale_by_light {
+                return fail(
+                    "subsurface.model names a medium, whose light is physical; expected shading.incident = \"inverse-square\" or \
+                     \"none\" and residual.scale_by_light = true"
+                        .into(),
+                );
+            }
+            let fits = std::iter::once(&medium.from).chain(&medium.refit);
+            if !fits.clone().is_sorted() || !fits.clone().all(|f| (0.0..1.0).contains(f)) {
+                return fail("subsurface.from and subsurface.refit: expected ascending fractions of the run, 0 to 1".into());
+            }
+            if !(8..=512).contains(&medium.resolution) || medium.surfels < 100 || !(2..=32).contains(&medium.widths) {
+                return fail("subsurface: expected resolution 8 to 512, at least 100 surfels, widths 2 to 32".into());
+            }
+        }
         let positive = [
             ("steps", self.steps as f32),
             ("accumulate", self.accumulate as f32),

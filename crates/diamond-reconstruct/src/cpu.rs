@@ -7,7 +7,7 @@ use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
     Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, GaussianParameters, Layout,
-    Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
+    MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
 };
 use crate::{forward, mcmc};
 use diamond_camera::Camera;
@@ -26,6 +26,9 @@ pub struct CpuEngine {
     profile: Profile,
     counters: Counters,
 }
+
+/// Steps after which Gaussians look anew for the surfels around them.
+const ATTACH_STEPS: u64 = 100;
 
 /// Seconds per part of a step.
 #[derive(Debug, Clone, Default)]
@@ -120,13 +123,13 @@ impl CpuEngine {
                 Attribute::Rotation => rates.rotation * factor,
                 Attribute::Shear => rates.shear * factor,
                 Attribute::Opacity => rates.opacity * factor,
-                Attribute::Normal => rates.normal * factor,
+                Attribute::Normal => rates.normal * plan.normal_factor,
                 Attribute::BaseColor | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => {
-                    rates.material * factor
+                    rates.material * plan.material_factor
                 }
-                Attribute::VisibilitySh => rates.visibility_sh * factor,
-                Attribute::Transfer => rates.transfer * factor,
-                Attribute::Codes => rates.codes * factor,
+                Attribute::VisibilitySh => rates.visibility_sh * plan.material_factor,
+                Attribute::Transfer => rates.transfer * plan.material_factor,
+                Attribute::Codes => rates.codes * plan.material_factor,
             },
             step + 1,
             self.model.config.adam.sparse,
@@ -289,6 +292,12 @@ impl Engine for CpuEngine {
         }
         let t = self.profile.add("adam", t);
         let density = self.control_density(step, plan)?;
+        if plan.densify || (step + 1).is_multiple_of(ATTACH_STEPS) {
+            let model = &mut self.model;
+            if let Some(medium) = &mut model.medium {
+                medium.attach(&model.parameters.activate());
+            }
+        }
         self.profile.add("density control", t);
         Ok(StepReport {
             step,
@@ -303,6 +312,15 @@ impl Engine for CpuEngine {
 
     fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
         self.model.render(camera, lights)
+    }
+
+    fn adopt_medium(&mut self, medium: MediumTerm) -> Result<(), ReconstructError> {
+        let seeds = self.model.config.subsurface.seeds;
+        if let Some(sources) = self.model.adopt_medium(medium, seeds)? {
+            self.visibility.gather(&sources);
+            self.stats = DensityStats::new(self.model.len());
+        }
+        Ok(())
     }
 
     fn model(&mut self) -> Result<&Model, ReconstructError> {

@@ -10,7 +10,7 @@ use crate::rows::{
 };
 use crate::{
     Activated, ActivatedGrad, CombineVariant, Counters, DiffuseVariant, FresnelVariant, IncidentVariant,
-    MaskingVariant, Model, ReconstructError, StepPlan, error,
+    MaskingVariant, MediumTerm, Model, ReconstructError, StepPlan, error,
 };
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -79,10 +79,15 @@ impl Settings {
             visibility: if s.surface_visibility { SurfaceVisibility::Multiplied } else { SurfaceVisibility::Ignored },
             horizon_leak: s.horizon_leak,
             roughness,
-            use_residual: c.residual.network || c.residual.transfer,
+            use_residual: c.residual.network || c.residual.transfer || model.medium.is_some(),
             incident_offset,
             scale_residual_by_light: c.residual.scale_by_light,
         };
+        let mut shading = shading;
+        if model.medium.is_some() {
+            shading.brdf.diffuse = Diffuse::Omitted;
+            shading.combine = Combine::Additive;
+        }
         Self { shading, incident_gradient: c.residual.incident_gradient, normal_gradient: c.residual.normal_gradient }
     }
 
@@ -220,11 +225,16 @@ pub fn value_and_grad(
         }
         None => None,
     };
+    let medium = match &model.medium {
+        Some(term) => Some(term.rows(&rows, &lit, light, MediumTerm::tints(activated, &rows.visible))?),
+        None => None,
+    };
     let t = profile.add("residual forward", t);
     let mut features = geometry_features(activated, &rows.visible, layout);
     let transported = Transported {
         network: network.as_ref().map(|out| (out.residual.as_slice(), out.incident.as_slice())),
         transfer: transfer.as_ref().map(|(radiance, _)| radiance.as_slice()),
+        medium: medium.as_ref(),
         visibility: &lit.visibility,
     };
     transported.write(&mut features, 0, &rows.visible, layout);
@@ -288,6 +298,15 @@ pub fn value_and_grad(
         out.normals[i] = vector(channel::NORMAL);
         d_residual[3 * row..3 * row + 3].copy_from_slice(&vector(channel::RESIDUAL).to_array());
         d_incident[row] = layout.get(d, channel::INCIDENT);
+    }
+    if let (Some(term), Some(medium)) = (&model.medium, &medium) {
+        let grad = term.pull(&rows, &lit, light, medium, &d_residual)?;
+        for (row, &i) in rows.visible.iter().enumerate() {
+            let i = i as usize;
+            out.base_color[i] += grad.base_color[row];
+            out.normals[i] += grad.normals[row];
+            out.gaussians.means[i] += grad.positions[row];
+        }
     }
     let mut network_grad = Vec::new();
     let mut backward_rows = 0;

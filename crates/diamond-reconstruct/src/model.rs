@@ -3,11 +3,12 @@ use crate::adam::Moments;
 use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::{
-    Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout,
+    Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout, MediumTerm,
     MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit, write_atomically,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
+use diamond_medium::{Medium, Surface};
 use diamond_shading::{Activation, Mlp, ResidualNetwork, ResidualNetworkConfig};
 use diamond_splat::{PlyFormat, PlyTable, ScalarType, mean_squared_distance_to_nearest, ply_bytes, read_ply};
 use glam::{Quat, Vec3};
@@ -22,6 +23,8 @@ pub struct Model {
     pub network: Option<ResidualNetwork>,
     /// Adam moments of the network: trunk, residual head, incident head.
     pub network_moments: [Moments; 3],
+    /// The medium inside, once one was fitted.
+    pub medium: Option<MediumTerm>,
     /// Gains of the photographs.
     pub exposure: Exposure,
     /// Where the object is and how bright the lights are.
@@ -34,6 +37,11 @@ pub struct Model {
 const MIN_INITIAL_SCALE: f32 = 1e-4;
 /// Largest initial standard deviation, × scene radius: lone points would otherwise cover the image.
 const MAX_INITIAL_SCALE: f32 = 0.1;
+
+/// The fitted medium, in a run's folder.
+pub(crate) const MEDIUM_FILE: &str = "medium.toml";
+/// The surface that it fills, in a run's folder.
+pub(crate) const SURFACE_FILE: &str = "surface.ply";
 
 /// Gains of the photographs, in a run's folder.
 const EXPOSURE_FILE: &str = "exposure.toml";
@@ -100,7 +108,7 @@ impl Model {
         };
         let network_moments = network_moments(network.as_ref());
         let exposure = Exposure::default();
-        Ok(Self { parameters, network, network_moments, exposure, scene, config: config.clone() })
+        Ok(Self { parameters, network, network_moments, medium: None, exposure, scene, config: config.clone() })
     }
 
     /// Renders one camera under each light, with all maps. For several cameras or for the radiance alone see [`Renderer`].
@@ -141,7 +149,32 @@ impl Model {
         for (name, values) in self.network_tensors() {
             file.insert(name, &[values.len()], values.to_vec());
         }
-        file.write(&folder.join("network.safetensors"))
+        file.write(&folder.join("network.safetensors"))?;
+        self.save_medium(folder)
+    }
+
+    fn save_medium(&self, folder: &Path) -> Result<(), ReconstructError> {
+        let Some(term) = &self.medium else { return Ok(()) };
+        let text = term.medium().to_toml().map_err(error::stage("medium"))?;
+        write_atomically(&folder.join(SURFACE_FILE), &term.surface().mesh().to_ply())?;
+        write_atomically(&folder.join(MEDIUM_FILE), text.as_bytes())
+    }
+
+    fn load_medium(&mut self, folder: &Path) -> Result<(), ReconstructError> {
+        let (medium, surface) = (folder.join(MEDIUM_FILE), folder.join(SURFACE_FILE));
+        if !self.config.subsurface.model.has_medium() || !medium.exists() {
+            return Ok(());
+        }
+        let fail = |path: &Path, detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let mesh = diamond_pathtrace::read_ply(&surface).map_err(|e| fail(&surface, e.to_string()))?;
+        let surface =
+            Surface::new(mesh, self.config.subsurface.surfels).map_err(|e| fail(&surface, e.to_string()))?;
+        let medium = Medium::read(&medium).map_err(|e| fail(&medium, e.to_string()))?;
+        let activated = self.parameters.activate();
+        let falloff = self.scene.falloff(&self.config);
+        let (means, normals) = (&activated.gaussians.means, &activated.normals);
+        self.medium = Some(MediumTerm::new(surface, medium, falloff, means, normals)?);
+        Ok(())
     }
 
     /// Reads what [`Model::save`] wrote. Adam moments are zero.
@@ -166,6 +199,7 @@ impl Model {
             parameters,
             network: None,
             network_moments: Default::default(),
+            medium: None,
             exposure: Exposure::default(),
             scene,
             config: config.clone(),
@@ -187,6 +221,7 @@ impl Model {
             model.network_moments = network_moments(Some(&network));
             model.network = Some(network);
         }
+        model.load_medium(folder)?;
         Ok(model)
     }
 

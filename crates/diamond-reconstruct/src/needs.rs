@@ -143,6 +143,8 @@ needs! {
     incident_head: Model, "a head of the network";
     /// The gradient of the network's inputs.
     input_gradient: Model, "a product with the first layer";
+    /// A homogeneous medium inside the object.
+    medium: Model, "a surface and a fit, some three times a run, and a look-up for every visible Gaussian";
     /// Latent codes.
     codes: Model, "inputs of the network and their part of Adam";
     /// Transfer vectors.
@@ -172,7 +174,7 @@ impl Needs {
     pub fn decide(config: &Config, facts: &CaptureFacts) -> Self {
         let (loss, shading, residual) = (&config.loss, &config.shading, &config.residual);
         let learned = shading.incident == IncidentVariant::Learned;
-        let subsurface = residual.network || residual.transfer;
+        let subsurface = residual.network || residual.transfer || config.subsurface.model.has_medium();
         let no_subsurface = "no subsurface part: residual.network = false and residual.transfer = false";
         let metal = shading.metal != MetalVariant::No;
         let no_metal = "shading.metal = \"no\": the surface is a dielectric, metalness is 0";
@@ -271,6 +273,10 @@ impl Needs {
                 (_, true, _) => Decision::new(true, "the codes learn by it"),
                 (_, _, true) => Decision::new(true, "residual.normal_gradient = true: the normals learn by it"),
                 _ => Decision::new(false, "residual.normal_gradient = false and residual.codes = 0"),
+            },
+            medium: match config.subsurface.model.has_medium() {
+                true => Decision::new(true, "subsurface.model names one"),
+                false => Decision::new(false, "subsurface.model = \"mlp\": the network alone"),
             },
             codes: Decision::new(residual.codes > 0, format!("residual.codes = {}", residual.codes))
                 .only_if(residual.network, "only the network reads codes (residual.network = false)"),
@@ -392,7 +398,7 @@ impl Needs {
         let nil = |what: &str, value: f32| format!("nil: the largest {what} is {value:.1e}, at most {NIL}");
         let subsurface = self.residual_channels.clone().only_if(subsurface > NIL, &nil("subsurfaceness", subsurface));
         let reads_visibility =
-            self.shadows.needed || self.network.needed && (subsurface.needed || self.incident_head.needed);
+            self.shadows.needed || (self.network.needed || self.medium.needed) && (subsurface.needed || self.incident_head.needed);
         RenderNeeds {
             metal: self.metalness_channel.clone().only_if(metal > NIL, &nil("metalness", metal)),
             incident: self.incident_head.clone(),

@@ -227,6 +227,11 @@ impl Reconstruction {
     /// One training step.
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
         let plan = StepPlan::new(&self.config, self.step);
+        if plan.fit_medium {
+            let model = self.engine.model()?;
+            let medium = crate::fit_medium(model, &self.capture)?;
+            self.engine.adopt_medium(medium)?;
+        }
         let batch = self.config.accumulate as u64;
         let mut loaded: Vec<Loaded> = Vec::with_capacity(batch as usize);
         for k in 0..batch {

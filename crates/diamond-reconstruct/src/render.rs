@@ -12,8 +12,9 @@ use crate::forward::{Settings, raster_config};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
+use crate::medium_term::white;
 use crate::visibility_cache::{LightKey, Tracer, key};
-use crate::{Activated, CaptureFacts, Model, Needs, ReconstructError, Rendering, error};
+use crate::{Activated, CaptureFacts, MediumTerm, Model, Needs, ReconstructError, Rendering, error};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
@@ -272,6 +273,10 @@ impl<'m> Renderer<'m> {
         };
         let transfer = transfer_config(model).filter(|_| self.needs.subsurface.needed);
         let transfer = transfer.map(|config| (rows.transfer.as_slice(), config));
+        let tints = match &model.medium {
+            Some(_) if self.needs.subsurface.needed => MediumTerm::tints(&self.activated, &rows.visible),
+            _ => Vec::new(),
+        };
         let lit =
             LitRows::new(&rows.positions, network, transfer, &scaling).map_err(error::stage("transfer vectors"))?;
         let mut settings = Settings::rendering(self.model);
@@ -286,7 +291,7 @@ impl<'m> Renderer<'m> {
         };
         let size = (weights.size()[0], weights.size()[1]);
         let channels = LightChannels { places, per_light: per_light.count() };
-        Ok(ViewHalf { channels, size, visible, weights, rows, lit, shader, prepared })
+        Ok(ViewHalf { channels, size, visible, weights, rows, tints, lit, shader, prepared })
     }
 
     /// Blends the light-independent channels and prepares the blocks that show anything, line by line.
@@ -342,7 +347,7 @@ impl<'m> Renderer<'m> {
             lights.par_iter().map(|light| self.visibility(view, light)).collect::<Result<_, _>>()?;
         let lit: Vec<(OlatLight, &[f32])> =
             lights.iter().zip(&visibility).map(|(light, v)| (*light, v.as_slice())).collect();
-        view.features(&lit, features)?;
+        view.features(self.model.medium.as_ref(), &lit, features)?;
         let features = features.as_slice();
         let lights: Vec<OlatLight> = lights.iter().map(|light| self.model.scene.scaled_light(light)).collect();
         images.resize_with(lights.len(), || Image::new(region.width, region.height, WIDTH));
@@ -472,6 +477,8 @@ struct ViewHalf {
     weights: BlendWeights,
     /// Of the Gaussians that pass something to a pixel.
     rows: Rows,
+    /// Their tints, where there is a medium.
+    tints: Vec<Vec3>,
     /// The same, ready for lights.
     lit: LitRows,
     shader: BlockShader,
@@ -510,7 +517,15 @@ impl ViewHalf {
     }
 
     /// The channels of all `lights`, row by row.
-    fn features(&self, lights: &[(OlatLight, &[f32])], features: &mut Vec<f32>) -> Result<(), ReconstructError> {
+    fn features(
+        &self,
+        medium: Option<&MediumTerm>,
+        lights: &[(OlatLight, &[f32])],
+        features: &mut Vec<f32>,
+    ) -> Result<(), ReconstructError> {
+        let lamps: Vec<OlatLight> = lights.iter().map(|(light, _)| white(light)).collect();
+        let medium = medium.filter(|_| !self.tints.is_empty());
+        let leaving = medium.map_or(Ok(Vec::new()), |medium| medium.leaving(&lamps))?;
         let width = self.channels.per_light * lights.len();
         features.resize(self.rows.len() * width, 0.0);
         // Asked here: the setting belongs to the thread that called.
@@ -519,7 +534,16 @@ impl ViewHalf {
         tasks.enumerate().try_for_each(|(task, piece)| {
             let first = task * LitRows::TASK_ROWS;
             let put = |row: usize, values: &[f32]| {
-                piece[(row - first) * width..][..width].copy_from_slice(values);
+                let to = &mut piece[(row - first) * width..][..width];
+                to.copy_from_slice(values);
+                let (Some(medium), Some(place)) = (medium, self.channels.places.residual) else { return };
+                let (position, normal) = (self.rows.positions[row], self.rows.normals[row]);
+                let lit = lights.iter().zip(&lamps).zip(&leaving);
+                for (to, ((light, lamp), leaving)) in to.chunks_exact_mut(self.channels.per_light).zip(lit) {
+                    let (i, visibility) = (self.rows.visible[row] as usize, light.1.get(row).copied().unwrap_or(0.0));
+                    let rgb = medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility);
+                    to[place..place + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
+                }
             };
             self.lit.task(task, level, lights, &self.channels, put).map_err(error::stage("residual network"))
         })

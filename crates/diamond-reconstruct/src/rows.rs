@@ -1,5 +1,6 @@
 //! The visible Gaussians row by row: what the residual reads of them, and the feature rows that the rasteriser blends.
 use crate::channel_layout::ChannelLayout;
+use crate::medium_term::MediumRows;
 use crate::{Activated, Attribute, Model, ReconstructError, error};
 use diamond_camera::Camera;
 use diamond_light::{OlatLight, spherical_harmonics};
@@ -177,6 +178,8 @@ pub(crate) struct Transported<'a> {
     pub network: Option<(&'a [f32], &'a [f32])>,
     /// Of the transfer vectors, rows × 3.
     pub transfer: Option<&'a [f32]>,
+    /// Of the medium.
+    pub medium: Option<&'a MediumRows>,
     /// Visibility per row.
     pub visibility: &'a [f32],
 }
@@ -186,7 +189,8 @@ impl Transported<'_> {
     pub fn residual(&self, row: usize) -> [f32; 3] {
         std::array::from_fn(|k| {
             let network = self.network.map_or(0.0, |(residual, _)| residual[3 * row + k]);
-            network + self.transfer.map_or(0.0, |t| t[3 * row + k])
+            let medium = self.medium.map_or(0.0, |m| m.residual(row)[k]);
+            network + self.transfer.map_or(0.0, |t| t[3 * row + k]) + medium
         })
     }
 

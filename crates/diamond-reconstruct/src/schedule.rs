@@ -26,6 +26,12 @@ pub struct StepPlan {
     pub prune_large: bool,
     /// Whether opacities are reset after this step.
     pub reset_opacity: bool,
+    /// Factor on the rate of normals.
+    pub normal_factor: f32,
+    /// Factor on the rates of materials.
+    pub material_factor: f32,
+    /// Whether surface and medium are fitted before this step.
+    pub fit_medium: bool,
     /// Factor on the weights of geometric consistency: as many steps as this one stands for, 0 where it stands for none.
     pub consistency: f32,
 }
@@ -71,10 +77,17 @@ impl StepPlan {
             DensityStrategy::None => 0,
             _ => (from / d.every_steps + 1) * d.every_steps,
         };
+        let m = &config.subsurface;
+        let with_medium = m.model.has_medium() && step >= at(m.from);
+        let (shape_rate, normal_rate, material_rate) =
+            if with_medium { (m.shape_rate, m.normal_rate, m.material_rate) } else { (1.0, 1.0, 1.0) };
+        let mut fits = std::iter::once(&m.from).chain(&m.refit);
         let comparing = done > at(c.from).max(first_round) && done <= at(c.until) && done.is_multiple_of(c.every_steps);
         Self {
-            mean_rate: log_lerp(r.mean, r.mean_final, mean_progress),
-            attribute_factor: log_lerp(1.0, r.attribute_final, fraction),
+            mean_rate: log_lerp(r.mean, r.mean_final, mean_progress) * shape_rate,
+            attribute_factor: log_lerp(1.0, r.attribute_final, fraction) * shape_rate,
+            normal_factor: log_lerp(1.0, r.attribute_final, fraction) * normal_rate,
+            material_factor: log_lerp(1.0, r.attribute_final, fraction) * material_rate,
             exposure_factor: match (config.exposure.from..config.exposure.until).contains(&fraction) {
                 true => log_lerp(1.0, r.attribute_final, fraction),
                 false => 0.0,
@@ -86,8 +99,13 @@ impl StepPlan {
             densify: active && done > from && done.is_multiple_of(d.every_steps),
             grow: !frozen,
             prune_large: fraction >= d.large_from,
+            fit_medium: m.model.has_medium() && fits.any(|f| at(*f) == step),
             consistency: if comparing { c.every_steps as f32 } else { 0.0 },
-            reset_opacity: adaptive && reset > 0 && done.is_multiple_of(reset) && done < until,
+            reset_opacity: adaptive
+                && reset > 0
+                && done.is_multiple_of(reset)
+                && done < until
+                && !(with_medium && m.seeds > 0),
         }
     }
 }

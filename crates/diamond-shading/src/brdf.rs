@@ -31,6 +31,8 @@ pub enum Diffuse {
     /// (SSS-3DGS). White dielectrics seen from above lose a little; seen at grazing angles they still gain up to a quarter.
     #[default]
     FresnelWeighted,
+    /// None: what is diffused comes from transport under the surface instead.
+    Omitted,
 }
 
 /// One choice of masking, Fresnel and diffuse term. The default is the physical one of each.
@@ -96,6 +98,7 @@ impl BrdfModel {
         let diffuse = match self.diffuse {
             Diffuse::Lambert => lambert,
             Diffuse::FresnelWeighted => f.complement() * specular.same(1.0 - DIELECTRIC_F0) * lambert,
+            Diffuse::Omitted => lambert * specular.same(0.0),
         };
         f * specular + diffuse
     }
@@ -135,6 +138,7 @@ impl BrdfModel {
         let dielectric = material.metalness.complement() * FRAC_1_PI;
         let d_lambert = match self.diffuse {
             Diffuse::Lambert => d_out,
+            Diffuse::Omitted => d_out * d.same(0.0),
             Diffuse::FresnelWeighted => {
                 let weighted = d_out * d.same(1.0 - DIELECTRIC_F0);
                 d_f = d_f - weighted * material.base_color * dielectric;
@@ -333,8 +337,11 @@ mod tests {
             (Fresnel::Schlick, naive::Fresnel::Schlick),
             (Fresnel::SphericalGaussian, naive::Fresnel::SphericalGaussian),
         ];
-        let diffuses =
-            [(Diffuse::Lambert, naive::Diffuse::Lambert), (Diffuse::FresnelWeighted, naive::Diffuse::FresnelWeighted)];
+        let diffuses = [
+            (Diffuse::Lambert, naive::Diffuse::Lambert),
+            (Diffuse::FresnelWeighted, naive::Diffuse::FresnelWeighted),
+            (Diffuse::Omitted, naive::Diffuse::Omitted),
+        ];
         let mut all = Vec::new();
         for (masking, m) in maskings {
             for (fresnel, f) in fresnels {

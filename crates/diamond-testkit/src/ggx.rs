@@ -34,6 +34,8 @@ pub enum Diffuse {
     Lambert,
     /// (1 − F)·0.96·(1 − m)·c/π.
     FresnelWeighted,
+    /// None.
+    Omitted,
 }
 
 /// A combination of the three.
@@ -119,6 +121,7 @@ pub fn evaluate_at<R: Real>(model: Model, base: R, roughness: R, metalness: R, a
     let diffuse = match model.diffuse {
         Diffuse::Lambert => lambert,
         Diffuse::FresnelWeighted => (one - f) * R::of(0.96) * lambert,
+        Diffuse::Omitted => R::of(0.0),
     };
     diffuse + specular
 }

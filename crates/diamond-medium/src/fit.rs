@@ -1,0 +1,426 @@
+//! A medium from photographs: non-negative least squares over what a profile's widths, local light and a coat would show.
+//!
+//! Everything is linear in the unknowns, so a few photographs are enough, and other lights cost nothing. Unknown are, per channel,
+//! a weight ≥ 0 for each width and for light that leaves where it enters, and for all channels one scale ≥ 0 of a GGX coat at three roughnesses. Rows are weighted
+//! by the slope of the sRGB curve between photograph and prediction, so that what is minimised is close to the error of the displayed
+//! picture; a few rounds make it consistent.
+use crate::medium::{Coat, Described, Medium, Quality, Transport};
+use crate::{Attachment, MediumError, Surface};
+use diamond_camera::Camera;
+use diamond_image::{Image, Mask, Transfer};
+use diamond_light::{Falloff, OlatLight};
+use diamond_pathtrace::{Facing, NO_PRIMITIVE};
+use diamond_shading::{
+    Balance, BrdfModel, Entry, Material, NormalEquations, NormalizedDiffusion, RadialProfile, SolveOptions,
+    SurfelLighting, SurfelTransport, Surfels,
+};
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// Roughnesses at which the coat is offered.
+pub const COATS: [f32; 3] = [0.2, 0.35, 0.6];
+/// Values at and above this are full film: they only say that there was at least as much.
+const FULL: f32 = 0.995;
+/// Rounds of weighting.
+const ROUNDS: usize = 3;
+
+/// One photograph.
+#[derive(Debug, Clone, Copy)]
+pub struct FitImage<'a> {
+    /// From where.
+    pub camera: &'a Camera,
+    /// Under which light.
+    pub light: &'a OlatLight,
+    /// Linear RGB over black, the camera's size.
+    pub radiance: &'a Image,
+    /// Coverage: pixels below one half are not looked at.
+    pub mask: Option<&'a Mask>,
+    /// Factor on what leaves the medium, linear RGB, where something is known of it.
+    pub tint: Option<&'a Image>,
+    /// What else is there, linear RGB: then no coat is fitted.
+    pub known: Option<&'a Image>,
+}
+
+/// How a fit goes about it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FitOptions {
+    /// Gaussians of the profile.
+    pub widths: usize,
+    /// Width of the widest, radii of the object.
+    pub widest: f32,
+    /// At most this many pixels are looked at, spread evenly over all photographs.
+    pub pixels: usize,
+    /// Falloff of the lights.
+    pub falloff: Falloff,
+    /// Irradiance of a light of intensity 1 (the scene's light scale).
+    pub unit: f32,
+    /// Ridge of the least squares, as a fraction of the diagonal.
+    pub ridge: f64,
+}
+
+impl Default for FitOptions {
+    fn default() -> Self {
+        Self { widths: 12, widest: 1.0, pixels: 40_000, falloff: Falloff::None, unit: 1.0, ridge: 1e-6 }
+    }
+}
+
+/// A pixel of a photograph that shows the surface.
+struct Seen {
+    pixel: usize,
+    position: Vec3,
+    normal: Vec3,
+    shading: Vec3,
+    toward_eye: Vec3,
+}
+
+/// One photograph's pixels and what each unknown would show there.
+struct Rows<'a> {
+    image: FitImage<'a>,
+    pixels: Vec<usize>,
+    /// pixels × (shared + coats), under a light of intensity 1.
+    values: Vec<f32>,
+    intensity: Vec3,
+}
+
+/// Intensity or irradiance.
+pub(crate) fn intensity(light: &OlatLight) -> Vec3 {
+    match light {
+        OlatLight::Point { intensity, .. } => *intensity,
+        OlatLight::Directional { irradiance, .. } => *irradiance,
+    }
+}
+
+/// The same light with intensity 1.
+pub(crate) fn white(light: &OlatLight) -> OlatLight {
+    match *light {
+        OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
+        OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
+    }
+}
+
+fn key(light: &OlatLight) -> [u32; 4] {
+    let (kind, v) = match *light {
+        OlatLight::Point { position, .. } => (0, position),
+        OlatLight::Directional { direction, .. } => (1, direction),
+    };
+    [kind, v.x.to_bits(), v.y.to_bits(), v.z.to_bits()]
+}
+
+/// Scalar irradiance of places under lights of intensity 1: places × lights.
+pub(crate) fn irradiance(
+    surface: &Surface,
+    positions: &[Vec3],
+    normals: &[Vec3],
+    lights: &[OlatLight],
+    falloff: Falloff,
+) -> Result<Vec<f32>, MediumError> {
+    let visibility = surface.visibility(positions, normals, lights);
+    let lighting =
+        SurfelLighting { positions, normals, visibility: &visibility, lights, falloff, entry: Entry::Full };
+    Ok(lighting.irradiance()?.into_iter().step_by(3).collect())
+}
+
+/// Transport between the surfels of a surface.
+pub(crate) fn surfel_transport(surface: &Surface, widths: Vec<f32>) -> Result<SurfelTransport, MediumError> {
+    let surfels = Surfels {
+        positions: surface.positions().to_vec(),
+        areas: surface.patches().iter().map(|p| p.area).collect(),
+    };
+    Ok(SurfelTransport::new(surfels, widths, Balance::Plain)?)
+}
+
+pub(crate) fn normals_of(surface: &Surface) -> Vec<Vec3> {
+    surface.patches().iter().map(|p| p.normal).collect()
+}
+
+fn seen(surface: &Surface, image: &FitImage<'_>, stride: usize) -> Vec<Seen> {
+    let (w, h) = (image.camera.intrinsics.width as usize, image.camera.intrinsics.height as usize);
+    let each = (0..w * h).into_par_iter().filter_map(|pixel| {
+        // Diagonal lines of pixels, so that a stride skips in both directions.
+        let (x, y) = (pixel % w, pixel / w);
+        if (x + 3 * y) % stride != 0 || image.mask.is_some_and(|m| m.coverage(x, y) < 0.5) {
+            return None;
+        }
+        let ray = image.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+        let geometry = surface.geometry();
+        let hit = geometry.closest_hit(ray.origin, ray.direction, f32::INFINITY, Facing::Entering, NO_PRIMITIVE)?;
+        let shading = geometry.shading_normal(&hit);
+        Some(Seen { pixel, position: hit.position, normal: hit.normal, shading, toward_eye: -ray.direction })
+    });
+    each.collect()
+}
+
+/// What the photographs say, as columns of unknowns.
+struct Evidence<'a> {
+    rows: Vec<Rows<'a>>,
+    shared: usize,
+    coats: usize,
+    unit: f32,
+}
+
+/// The lights of photographs, each once, and which photograph has which.
+fn lights_of(images: &[FitImage<'_>]) -> (Vec<OlatLight>, Vec<usize>) {
+    let (mut lights, mut index, mut places) = (Vec::new(), Vec::new(), BTreeMap::new());
+    for image in images {
+        let place = *places.entry(key(image.light)).or_insert_with(|| {
+            lights.push(white(image.light));
+            lights.len() - 1
+        });
+        index.push(place);
+    }
+    (lights, index)
+}
+
+impl<'a> Evidence<'a> {
+    /// `surfels`: for each column that is shared, surfels × lights of radiosity under lights of intensity 1; a local column is added.
+    fn new(
+        surface: &Surface,
+        images: &[FitImage<'a>],
+        columns: &[Vec<f32>],
+        index: &[usize],
+        lights: usize,
+        options: &FitOptions,
+    ) -> Result<Self, MediumError> {
+        let total: usize = images.iter().map(|i| (i.camera.intrinsics.width * i.camera.intrinsics.height) as usize).sum();
+        let covered: f64 = images
+            .iter()
+            .map(|i| i.mask.map_or(0.3, |m| f64::from(m.area() / (m.width() * m.height()).max(1) as f32)))
+            .sum::<f64>()
+            / images.len().max(1) as f64;
+        let stride = ((total as f64 * covered / options.pixels.max(1) as f64).ceil() as usize).max(1);
+        let coats = if images.iter().any(|i| i.known.is_some()) { 0 } else { COATS.len() };
+        let shared = columns.len() + 1;
+        let brdf = BrdfModel::default();
+        let rows = images.iter().zip(index).map(|(image, light)| -> Result<Rows<'a>, MediumError> {
+            let places = seen(surface, image, stride);
+            let positions: Vec<Vec3> = places.iter().map(|s| s.position).collect();
+            let normals: Vec<Vec3> = places.iter().map(|s| s.normal).collect();
+            let attachment: Attachment = surface.attach(&positions, &normals);
+            let lamp = [white(image.light)];
+            let visibility = surface.visibility(&positions, &normals, &lamp);
+            let width = shared + coats;
+            let mut values = vec![0.0f32; width * places.len()];
+            values.par_chunks_exact_mut(width).zip(&places).enumerate().for_each(|(n, (row, place))| {
+                for (column, out) in columns.iter().zip(row.iter_mut()) {
+                    let sum: f32 = attachment.of(n).map(|(j, w)| w * column[j * lights + light]).sum();
+                    *out = sum / std::f32::consts::PI;
+                }
+                let arriving = lamp[0].incidence(place.position, options.falloff);
+                let lit = arriving.irradiance * visibility[n];
+                row[columns.len()] = lit.x * place.shading.dot(arriving.direction).max(0.0) / std::f32::consts::PI;
+                for (out, roughness) in row[shared..].iter_mut().zip(COATS) {
+                    let coat = Material { base_color: Vec3::ZERO, roughness, metalness: 0.0 };
+                    *out = brdf.reflect(&coat, place.shading, place.toward_eye, arriving.direction, lit).x;
+                }
+            });
+            let pixels = places.iter().map(|s| s.pixel).collect();
+            Ok(Rows { image: *image, pixels, values, intensity: intensity(image.light) * options.unit })
+        });
+        let rows = rows.collect::<Result<Vec<_>, _>>()?;
+        if rows.iter().all(|r| r.pixels.is_empty()) {
+            return Err(MediumError::Unusable {
+                detail: "no pixel of any photograph shows the surface; is it in the frame of the cameras?".into(),
+            });
+        }
+        Ok(Self { rows, shared, coats, unit: options.unit })
+    }
+
+    fn unknowns(&self) -> usize {
+        3 * self.shared + self.coats
+    }
+
+    fn width(&self) -> usize {
+        self.shared + self.coats
+    }
+
+    /// Channel `c` of pixel `n` of a photograph: factor of the shared columns, what is known, the photograph.
+    fn pixel(rows: &Rows<'_>, n: usize, c: usize) -> (f32, f32, f32) {
+        let at = 3 * rows.pixels[n] + c;
+        let of = |image: Option<&Image>, otherwise: f32| image.map_or(otherwise, |i| i.data()[at]);
+        (of(rows.image.tint, 1.0), of(rows.image.known, 0.0), rows.image.radiance.data()[at])
+    }
+
+    /// What is predicted for channel `c` of pixel `n` (without what is known), from coefficients of shared columns per channel and coats.
+    fn predicted(&self, rows: &Rows<'_>, x: &[f64], n: usize, c: usize) -> f32 {
+        let row = &rows.values[n * self.width()..(n + 1) * self.width()];
+        let (tint, ..) = Self::pixel(rows, n, c);
+        let under: f64 = row[..self.shared].iter().zip(&x[c * self.shared..]).map(|(v, x)| f64::from(*v) * x).sum();
+        let coat: f64 = row[self.shared..].iter().zip(&x[3 * self.shared..]).map(|(v, x)| f64::from(*v) * x).sum();
+        rows.intensity[c] * (tint * under as f32 + coat as f32)
+    }
+
+    fn equations(&self, x: Option<&[f64]>) -> NormalEquations {
+        let parts: Vec<NormalEquations> = self
+            .rows
+            .par_iter()
+            .map(|rows| {
+                let mut equations = NormalEquations::new(self.unknowns());
+                let mut row = vec![0.0; self.unknowns()];
+                for n in 0..rows.pixels.len() {
+                    let values = &rows.values[n * self.width()..(n + 1) * self.width()];
+                    for c in 0..3 {
+                        let (tint, known, b) = Self::pixel(rows, n, c);
+                        if b >= FULL {
+                            continue;
+                        }
+                        row.fill(0.0);
+                        for (k, v) in values.iter().enumerate() {
+                            let (at, factor) =
+                                if k < self.shared { (c * self.shared + k, tint) } else { (2 * self.shared + k, 1.0) };
+                            row[at] = f64::from(*v * rows.intensity[c] * factor);
+                        }
+                        let guess = x.map_or(b, |x| (known + self.predicted(rows, x, n, c)).clamp(0.0, 1.0));
+                        let slope = slope(b, guess);
+                        equations.add(&row, f64::from(b - known), f64::from(slope * slope));
+                    }
+                }
+                equations
+            })
+            .collect();
+        let mut all = NormalEquations::new(self.unknowns());
+        for part in &parts {
+            // Of equal size by construction.
+            let _ = all.merge(part);
+        }
+        all
+    }
+
+    fn solve(&self, ridge: f64) -> (Vec<f64>, NormalEquations) {
+        let mut equations = self.equations(None);
+        let mut x = equations.solve(&SolveOptions { ridge });
+        for _ in 1..ROUNDS {
+            equations = self.equations(Some(&x));
+            x = equations.solve(&SolveOptions { ridge });
+        }
+        (x, equations)
+    }
+
+    /// How well `x` explains the photographs.
+    fn quality(&self, x: &[f64]) -> Quality {
+        let encode = |v: f32| Transfer::Srgb.encode(v.clamp(0.0, 1.0));
+        let (mut squares, mut truth, mut count) = (0.0f64, 0.0f64, 0u64);
+        // Differences of a pixel under all lights of its view, where there are several.
+        let mut views: BTreeMap<*const Camera, BTreeMap<usize, ([f64; 3], f64, u32)>> = BTreeMap::new();
+        for rows in &self.rows {
+            let view = views.entry(std::ptr::from_ref(rows.image.camera)).or_default();
+            for n in 0..rows.pixels.len() {
+                let entry = view.entry(rows.pixels[n]).or_insert(([0.0; 3], 0.0, 0));
+                entry.2 += 1;
+                for c in 0..3 {
+                    let (_, known, b) = Self::pixel(rows, n, c);
+                    let d = f64::from(encode(known + self.predicted(rows, x, n, c)) - encode(b));
+                    squares += d * d;
+                    truth += f64::from(encode(b)).powi(2);
+                    count += 1;
+                    entry.0[c] += d;
+                    entry.1 += d * d;
+                }
+            }
+        }
+        let (mut same, mut all) = (0.0f64, 0.0f64);
+        for (sum, square, n) in views.values().flat_map(BTreeMap::values).filter(|v| v.2 > 1) {
+            same += sum.iter().map(|s| s * s).sum::<f64>() / f64::from(*n);
+            all += square;
+        }
+        let mean = squares / count.max(1) as f64;
+        Quality {
+            images: self.rows.len(),
+            relative_error: (squares / truth.max(1e-12)).sqrt() as f32,
+            psnr: (-10.0 * mean.max(1e-12).log10()) as f32,
+            constant_part: if all > 0.0 { (same / all) as f32 } else { 0.0 },
+        }
+    }
+
+    /// Roughness and scale of the coat that the coefficients amount to.
+    fn coat(&self, x: &[f64]) -> Coat {
+        let scales = &x[3 * self.shared..];
+        let sum: f64 = scales.iter().sum();
+        if sum <= 0.0 {
+            return Coat { roughness: 0.5, scale: 0.0 };
+        }
+        let roughness = scales.iter().zip(COATS).map(|(s, r)| s * f64::from(r)).sum::<f64>() / sum;
+        Coat { roughness: roughness as f32, scale: sum as f32 }
+    }
+}
+
+/// Slope of the sRGB curve between two values.
+fn slope(a: f32, b: f32) -> f32 {
+    if (a - b).abs() < 1e-3 {
+        return Transfer::Srgb.encode_pull(0.5 * (a + b), 1.0);
+    }
+    (Transfer::Srgb.encode(a) - Transfer::Srgb.encode(b)) / (a - b)
+}
+
+/// Widths that a profile between the surfels of a surface is offered.
+pub fn offered_widths(surface: &Surface, options: &FitOptions) -> Vec<f32> {
+    let widest = (options.widest * surface.radius()).max(1.1 * surface.spacing());
+    RadialProfile::geometric_widths(surface.spacing(), widest, options.widths)
+}
+
+/// Fits a profile and a coat to photographs.
+pub fn fit_profile(surface: &Surface, images: &[FitImage<'_>], options: &FitOptions) -> Result<Medium, MediumError> {
+    let (lights, index) = lights_of(images);
+    if lights.is_empty() {
+        return Err(MediumError::Unusable { detail: "a fit needs at least one photograph".into() });
+    }
+    let transport = surfel_transport(surface, offered_widths(surface, options))?;
+    let entering = irradiance(surface, surface.positions(), &normals_of(surface), &lights, options.falloff)?;
+    let columns = transport.receivers(surface.positions())?.basis(&entering)?;
+    let evidence = Evidence::new(surface, images, &columns, &index, lights.len(), options)?;
+    let (x, equations) = evidence.solve(options.ridge);
+    let s = evidence.shared;
+    let weights = (0..s - 1).map(|k| std::array::from_fn(|c| x[c * s + k] as f32)).collect();
+    let local = std::array::from_fn(|c| x[c * s + s - 1] as f32);
+    let described = describe(transport.widths(), &equations, &x, s)?;
+    Ok(Medium {
+        unit: evidence.unit,
+        transport: Transport::Profile { widths: transport.widths().to_vec(), weights, local },
+        coat: evidence.coat(&x),
+        quality: Some(evidence.quality(&x)),
+        described: Some(described),
+    })
+}
+
+/// Steps of the search along each of reflectance and mean free path, and its rounds.
+const SEARCH: (i32, usize) = (10, 3);
+
+/// The two-parameter profile that fits the same equations best, the rest as in `x`.
+fn describe(widths: &[f32], equations: &NormalEquations, x: &[f64], s: usize) -> Result<Described, MediumError> {
+    let mut found = Described { reflectance: [0.0; 3], mean_free_path: [0.0; 3] };
+    let mut best = x.to_vec();
+    for c in 0..3 {
+        let mut at = (f64::INFINITY, 0.0, 0.0);
+        let (mut low, mut high) =
+            ([0.02f32, libm::logf(0.2 * widths[0])], [1.0f32, libm::logf(widths[widths.len() - 1])]);
+        for _ in 0..SEARCH.1 {
+            for i in 0..=SEARCH.0 {
+                for j in 0..=SEARCH.0 {
+                    let t = |k: i32| k as f32 / SEARCH.0 as f32;
+                    let a = low[0] + (high[0] - low[0]) * t(i);
+                    let l = libm::expf(low[1] + (high[1] - low[1]) * t(j));
+                    let mut trial = best.clone();
+                    place(&mut trial[c * s..(c + 1) * s], widths, a, l)?;
+                    let error = equations.error(&trial);
+                    if error < at.0 {
+                        at = (error, a, l);
+                    }
+                }
+            }
+            let half = [0.2 * (high[0] - low[0]), 0.2 * (high[1] - low[1])];
+            low = [(at.1 - half[0]).max(0.01), libm::logf(at.2) - half[1]];
+            high = [(at.1 + half[0]).min(1.0), libm::logf(at.2) + half[1]];
+        }
+        (found.reflectance[c], found.mean_free_path[c]) = (at.1, at.2);
+        place(&mut best[c * s..(c + 1) * s], widths, at.1, at.2)?;
+    }
+    Ok(found)
+}
+
+/// Normalised diffusion as coefficients of the widths; nothing local.
+fn place(to: &mut [f64], widths: &[f32], reflectance: f32, mean_free_path: f32) -> Result<(), MediumError> {
+    let one = NormalizedDiffusion { albedo: Vec3::splat(reflectance), mean_free_path: Vec3::splat(mean_free_path) };
+    to.fill(0.0);
+    one.on_widths(widths)?.weights.iter().zip(to).for_each(|(w, to)| *to = f64::from(w.x));
+    Ok(())
+}

@@ -1,0 +1,179 @@
+//! The surface and the medium of a model as it stands, from its shape and from the photographs.
+//!
+//! Points of the surface come from the depth of the training views, where they are opaque; where no view sees, the Gaussians themselves stand in, with
+//! little weight. Silhouettes come from the masks. See [`diamond_medium::carve`].
+use crate::medium_term::{MediumTerm, TINT};
+use crate::{Config, InitialSource, Model, ReconstructError, Renderer, error};
+use diamond_dataset::{Capture, Observation, Shot, View};
+use diamond_image::Image;
+use diamond_medium::{
+    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, hull_bounds,
+};
+use diamond_shading::pseudo_normals;
+use diamond_splat::mean_squared_distance_to_nearest;
+use glam::{Vec2, Vec3};
+use std::sync::Arc;
+
+/// Views from which the surface is looked at, at most.
+const SHAPE_VIEWS: usize = 48;
+/// Points from all views together, about.
+const SHAPE_POINTS: usize = 200_000;
+/// Opacity above which a pixel shows the surface.
+const OPAQUE: f32 = 0.7;
+/// Weight of a Gaussian that no view shows, beside a pixel that shows the surface.
+const HIDDEN_WEIGHT: f32 = 1e-3;
+/// Photographs that a medium is fitted to, at most.
+const FIT_IMAGES: usize = 64;
+
+fn spread<T>(all: &[T], most: usize) -> impl Iterator<Item = &T> {
+    let n = all.len();
+    let count = n.min(most);
+    (0..count).map(move |k| &all[k * n / count])
+}
+
+/// Standard deviation of the weight of a point of the cloud, distances between points.
+const POINT_SMOOTHING: f32 = 1.5;
+/// Weight of a pixel that shows the surface beside a point of the capture's own cloud.
+const PIXEL_WEIGHT: f32 = 0.03;
+
+/// The capture's own points with their normals, if it has such; and the mean distance between them.
+fn cloud(capture: &Capture, config: &Config) -> Result<(Vec<OrientedPoint>, f32), ReconstructError> {
+    let wanted = matches!(config.initial.source, InitialSource::Auto | InitialSource::Points);
+    if !wanted || capture.points.is_none() {
+        return Ok((Vec::new(), 0.0));
+    }
+    let (_, points) = crate::survey(capture, config)?;
+    if points.splats.is_some() {
+        return Ok((Vec::new(), 0.0));
+    }
+    let each = points.positions.iter().zip(&points.normals).filter(|(_, n)| n.is_normalized());
+    let out: Vec<OrientedPoint> =
+        each.map(|(p, n)| OrientedPoint { position: *p, normal: *n, weight: 1.0 }).collect();
+    let positions: Vec<Vec3> = out.iter().map(|p| p.position).collect();
+    let squares = mean_squared_distance_to_nearest(&positions, 3);
+    let spacing = (squares.iter().sum::<f32>() / squares.len().max(1) as f32).sqrt();
+    Ok((out, spacing))
+}
+
+/// The surface of a model, as the training views show it.
+pub fn surface_of(model: &Model, capture: &Capture) -> Result<Surface, ReconstructError> {
+    let renderer = Renderer::new(model);
+    let views: Vec<&View> = spread(&capture.train, SHAPE_VIEWS).collect();
+    let (mut points, spacing) = cloud(capture, &model.config)?;
+    let pixel_weight = if points.is_empty() { 1.0 } else { PIXEL_WEIGHT };
+    let mut silhouettes = Vec::new();
+    let pixels: usize = views.iter().map(|v| (v.camera.intrinsics.width * v.camera.intrinsics.height) as usize).sum();
+    // The object fills a part of the picture only.
+    let stride = ((0.3 * pixels as f32 / SHAPE_POINTS as f32).sqrt().ceil() as usize).max(1);
+    for view in &views {
+        let camera = &view.camera;
+        let shape = renderer.shape(camera)?;
+        let (w, h, _) = shape.opacity.shape();
+        let each = shape.depth.data().iter().zip(shape.opacity.data());
+        let depth: Vec<f32> = each.map(|(d, o)| if *o > 0.0 { d / o } else { 0.0 }).collect();
+        let depth = Image::from_vec(w, h, 1, depth).map_err(error::stage("surface"))?;
+        let (normals, _) = pseudo_normals(camera, &depth, &shape.opacity).map_err(error::stage("surface"))?;
+        for y in (0..h).step_by(stride) {
+            for x in (0..w).step_by(stride) {
+                let Some(normal) = Vec3::from_slice(normals.pixel(x, y)).try_normalize() else { continue };
+                if shape.opacity.pixel(x, y)[0] < OPAQUE {
+                    continue;
+                }
+                let pixel = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
+                let position = camera.unproject(pixel, diamond_camera::Depth::Z(depth.pixel(x, y)[0]));
+                let toward = (camera.pose.centre() - position).normalize_or_zero();
+                // Grazing pixels know the depth badly.
+                let weight = normal.dot(toward).max(0.0).powi(2);
+                if weight > 0.01 && position.is_finite() {
+                    points.push(OrientedPoint { position, normal, weight: pixel_weight * weight });
+                }
+            }
+        }
+        if let Some(shot) = view.shots.first()
+            && let Some(mask) = &capture.observation(shot)?.mask
+        {
+            silhouettes.push(Silhouette::new(*camera, mask));
+        }
+    }
+    let activated = model.parameters.activate();
+    let g = &activated.gaussians;
+    for i in 0..g.means.len() {
+        let (position, normal) = (g.means[i], activated.normals[i]);
+        if position.is_finite() && normal.is_normalized() {
+            points.push(OrientedPoint { position, normal, weight: pixel_weight * HIDDEN_WEIGHT });
+        }
+    }
+    let (centre, reach) = (model.scene.centre(), 1.5 * model.scene.radius);
+    let mut bounds = (centre - reach, centre + reach);
+    if !silhouettes.is_empty()
+        && let Some((low, high)) = hull_bounds(&silhouettes, centre, reach * 1.2)
+    {
+        bounds = (bounds.0.max(low), bounds.1.min(high));
+    }
+    let settings = &model.config.subsurface;
+    let options = CarveOptions {
+        resolution: settings.resolution,
+        smoothing: settings.smoothing,
+        surfels: settings.surfels,
+        least_width: POINT_SMOOTHING * spacing,
+        match_silhouettes: true,
+    };
+    carve(&points, &silhouettes, bounds, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+}
+
+/// Fits a medium within `surface` to the training photographs.
+pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
+    let shots: Vec<(&View, &Shot)> =
+        capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
+    let chosen: Vec<(&View, &Shot)> = spread(&shots, FIT_IMAGES).copied().collect();
+    let observations: Vec<Arc<Observation>> =
+        chosen.iter().map(|(_, shot)| capture.observation(shot)).collect::<Result<_, _>>()?;
+    let tints = match model.medium {
+        Some(_) => tint_maps(model, &chosen)?,
+        None => Vec::new(),
+    };
+    let images: Vec<FitImage<'_>> = chosen
+        .iter()
+        .zip(&observations)
+        .enumerate()
+        .map(|(i, ((view, shot), observation))| FitImage {
+            camera: &view.camera,
+            light: &shot.light,
+            radiance: &observation.radiance,
+            mask: observation.mask.as_ref(),
+            tint: tints.get(i).map(|t| t.as_ref()),
+            known: None,
+        })
+        .collect();
+    let options = FitOptions {
+        widths: model.config.subsurface.widths,
+        falloff: model.scene.falloff(&model.config),
+        unit: model.scene.light_scale,
+        ..FitOptions::default()
+    };
+    fit_profile(surface, &images, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+}
+
+/// Tints as the views show them; neighbouring photographs of one view share theirs.
+fn tint_maps(model: &Model, chosen: &[(&View, &Shot)]) -> Result<Vec<Arc<Image>>, ReconstructError> {
+    let renderer = Renderer::new(model);
+    let mut out: Vec<Arc<Image>> = Vec::new();
+    for (i, (view, shot)) in chosen.iter().enumerate() {
+        if i > 0 && std::ptr::eq(*view, chosen[i - 1].0) {
+            out.push(Arc::clone(&out[i - 1]));
+            continue;
+        }
+        let rendering = renderer.renderings(&view.camera, &[shot.light])?;
+        out.push(Arc::new(rendering[0].maps.base_color.map(|v| TINT * v)));
+    }
+    Ok(out)
+}
+
+/// Surface and medium of a model as it stands, ready to be adopted.
+pub fn fit_medium(model: &Model, capture: &Capture) -> Result<MediumTerm, ReconstructError> {
+    let surface = surface_of(model, capture)?;
+    let medium = medium_of(model, capture, &surface)?;
+    let activated = model.parameters.activate();
+    let falloff = model.scene.falloff(&model.config);
+    MediumTerm::new(surface, medium, falloff, &activated.gaussians.means, &activated.normals)
+}

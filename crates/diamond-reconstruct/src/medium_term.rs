@@ -1,0 +1,325 @@
+//! Light that goes through a homogeneous medium inside the object, as a part of the model.
+//!
+//! [`MediumTerm`] holds a surface, a medium fitted to the photographs, and for each Gaussian the surfels around it. What leaves a surfel under
+//! a light is computed once per light, for all surfels at once; a Gaussian takes the mean of the surfels around it, adds
+//! what leaves where it enters (by its own normal and visibility, through which gradients reach its normal and position), and
+//! is tinted by its base colour. The network and the transfer vectors add what is left.
+//!
+//! With a medium the surface part is the coat alone (its diffuse lobe is the limit of transport over no distance, and part of the medium), and is added
+//! to what leaves the medium rather than mixed with it.
+use crate::rows::{LightRows, Rows};
+use crate::visibility_cache::{LightKey, key};
+use crate::{Activated, Attribute, Model, ReconstructError, error, logit};
+use diamond_light::{Falloff, OlatLight};
+use diamond_medium::{Attachment, Exitance, Medium, Near, Surface};
+use diamond_shading::{Entry, SurfelLighting};
+use glam::{Quat, Vec3};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+/// Logit of the subsurfaceness that Gaussians have when a medium comes in: nearly 1, and still able to fall to nil.
+pub(crate) const SUBSURFACENESS_LOGIT: f32 = 4.0;
+/// Logit of the metalness then: hardly any, where there may be some.
+const METALNESS_LOGIT: f32 = -4.0;
+/// The tint of a Gaussian is so many times its base colour: 1 in the middle of its range.
+pub(crate) const TINT: f32 = 2.0;
+/// Lights whose light under the surface is kept.
+const KEPT_LIGHTS: usize = 256;
+
+/// Radiance that leaves each surfel, surfels × 3, shared by all who ask.
+type Leaving = Arc<Vec<f32>>;
+
+/// A medium in a model.
+#[derive(Debug, Clone)]
+pub struct MediumTerm {
+    surface: Arc<Surface>,
+    medium: Arc<Medium>,
+    exitance: Arc<Exitance>,
+    falloff: Falloff,
+    kept: Arc<Mutex<BTreeMap<LightKey, Leaving>>>,
+    attachment: Attachment,
+}
+
+/// What the medium sends out of each row under one light of intensity 1, over the light's own falloff there, before the tint.
+pub(crate) struct MediumRows {
+    /// Linear RGB.
+    pub untinted: Vec<Vec3>,
+    /// Linear RGB.
+    pub tints: Vec<Vec3>,
+}
+
+impl MediumRows {
+    /// Linear RGB of a row.
+    pub fn residual(&self, row: usize) -> Vec3 {
+        self.untinted[row] * self.tints[row]
+    }
+}
+
+/// The gradient that reaches the Gaussians of the rows.
+pub(crate) struct MediumRowsGrad {
+    pub positions: Vec<Vec3>,
+    pub normals: Vec<Vec3>,
+    pub base_color: Vec<Vec3>,
+}
+
+/// The subsurfaceness that transport is divided by, so that a Gaussian with [`SUBSURFACENESS_LOGIT`] shows all of it.
+fn whole() -> f32 {
+    crate::sigmoid(SUBSURFACENESS_LOGIT)
+}
+
+impl MediumTerm {
+    /// A medium within a surface, for Gaussians with these positions and normals.
+    pub fn new(
+        surface: Surface,
+        medium: Medium,
+        falloff: Falloff,
+        positions: &[Vec3],
+        normals: &[Vec3],
+    ) -> Result<Self, ReconstructError> {
+        let exitance = Exitance::new(&surface, &medium).map_err(error::stage("medium"))?;
+        let attachment = surface.attach(positions, normals);
+        Ok(Self {
+            surface: Arc::new(surface),
+            medium: Arc::new(medium),
+            exitance: Arc::new(exitance),
+            falloff,
+            kept: Arc::default(),
+            attachment,
+        })
+    }
+
+    /// The surface that light enters and leaves through.
+    pub fn surface(&self) -> &Surface {
+        &self.surface
+    }
+
+    /// The medium.
+    pub fn medium(&self) -> &Medium {
+        &self.medium
+    }
+
+    /// The same surface and Gaussians with another medium.
+    pub fn with_medium(&self, medium: Medium) -> Result<Self, ReconstructError> {
+        let exitance = Exitance::new(&self.surface, &medium).map_err(error::stage("medium"))?;
+        Ok(Self { medium: Arc::new(medium), exitance: Arc::new(exitance), kept: Arc::default(), ..self.clone() })
+    }
+
+    /// Finds the surfels around Gaussians that have moved, or are others.
+    pub(crate) fn attach(&mut self, activated: &Activated) {
+        self.attachment = self.surface.attach(&activated.gaussians.means, &activated.normals);
+    }
+
+    /// The surfels around each Gaussian.
+    pub(crate) fn attachment(&self) -> &Attachment {
+        &self.attachment
+    }
+
+    /// Puts back surfels that were found before.
+    pub(crate) fn set_attachment(&mut self, attachment: Attachment) {
+        self.attachment = attachment;
+    }
+
+    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Leaving>> {
+        // Whoever panicked with the lock held left whole entries behind.
+        self.kept.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+    }
+
+    /// Radiance that leaves the surfels under each light with intensity 1. Those that are not known yet are computed together.
+    pub(crate) fn leaving(&self, lights: &[OlatLight]) -> Result<Vec<Leaving>, ReconstructError> {
+        let mut missing: Vec<OlatLight> = Vec::new();
+        {
+            let kept = self.kept();
+            for light in lights {
+                if !kept.contains_key(&key(light)) && !missing.iter().any(|m| key(m) == key(light)) {
+                    missing.push(*light);
+                }
+            }
+        }
+        let computed = match missing.is_empty() {
+            true => Vec::new(),
+            false => self.exitance.under(&self.surface, &missing, self.falloff).map_err(error::stage("medium"))?,
+        };
+        let fresh: BTreeMap<LightKey, Leaving> =
+            missing.iter().map(key).zip(computed.into_iter().map(Arc::new)).collect();
+        let mut kept = self.kept();
+        let out = lights.iter().map(|light| fresh.get(&key(light)).or_else(|| kept.get(&key(light))).cloned());
+        let out = out.collect::<Option<Vec<_>>>().ok_or_else(|| ReconstructError::Internal {
+            stage: "medium",
+            detail: "a light was forgotten while it was used".into(),
+        })?;
+        if kept.len() + fresh.len() > KEPT_LIGHTS {
+            kept.clear();
+        }
+        kept.extend(fresh);
+        Ok(out)
+    }
+
+    /// The tints of rows.
+    pub(crate) fn tints(activated: &Activated, visible: &[u32]) -> Vec<Vec3> {
+        visible.iter().map(|&i| activated.base_color[i as usize] * TINT).collect()
+    }
+
+    fn local(&self) -> Vec3 {
+        self.medium.local() / whole()
+    }
+
+    /// What leaves where it enters, per unit of the light's irradiance there.
+    fn lighting<'a>(rows: &'a Rows, lit: &'a LightRows, light: &'a [OlatLight]) -> SurfelLighting<'a> {
+        SurfelLighting {
+            positions: &rows.positions,
+            normals: &rows.normals,
+            visibility: &lit.visibility,
+            lights: light,
+            falloff: Falloff::None,
+            entry: Entry::Full,
+        }
+    }
+
+    /// What the medium sends out of each row.
+    pub(crate) fn rows(
+        &self,
+        rows: &Rows,
+        lit: &LightRows,
+        light: &OlatLight,
+        tints: Vec<Vec3>,
+    ) -> Result<MediumRows, ReconstructError> {
+        let leaving = &self.leaving(&[*light])?[0];
+        let lamp = [white(light)];
+        let (local, scale) = (self.local(), 1.0 / whole());
+        let own = match local {
+            Vec3::ZERO => Vec::new(),
+            _ => Self::lighting(rows, lit, &lamp).irradiance().map_err(error::stage("medium"))?,
+        };
+        let untinted = rows.visible.iter().enumerate().map(|(row, &i)| {
+            let around = self.attachment.rgb(i as usize, leaving) * self.over_falloff(&lamp[0], rows.positions[row]);
+            around * scale + own.get(3 * row).map_or(Vec3::ZERO, |e| local * *e)
+        });
+        Ok(MediumRows { untinted: untinted.collect(), tints })
+    }
+
+    /// One over the falloff of a light at a place.
+    pub(crate) fn over_falloff(&self, white: &OlatLight, at: Vec3) -> f32 {
+        let falls = white.incidence(at, self.falloff).irradiance.x;
+        if falls > f32::MIN_POSITIVE { 1.0 / falls } else { 0.0 }
+    }
+
+    /// Adds to `out` what one row sends out under each of several lights with known surfels: for the renderer, which goes row by row.
+    pub(crate) fn residual_at(
+        &self,
+        gaussian: usize,
+        position: Vec3,
+        normal: Vec3,
+        tint: Vec3,
+        lamp: &OlatLight,
+        leaving: &[f32],
+        visibility: f32,
+    ) -> Vec3 {
+        let around = self.attachment.rgb(gaussian, leaving) * self.over_falloff(lamp, position);
+        let cos_theta_i = normal.dot(lamp.incidence(position, Falloff::None).direction).max(0.0);
+        tint * (around * (1.0 / whole()) + self.local() * (visibility * cos_theta_i))
+    }
+
+    /// Pullback of [`MediumTerm::rows`] (tinted) to positions and normals, through what leaves where it enters, and to base colours. `d` is rows × 3.
+    pub(crate) fn pull(
+        &self,
+        rows: &Rows,
+        lit: &LightRows,
+        light: &OlatLight,
+        medium: &MediumRows,
+        d: &[f32],
+    ) -> Result<MediumRowsGrad, ReconstructError> {
+        let lamp = [white(light)];
+        let local = self.local();
+        let rgb = |row: usize| Vec3::from_slice(&d[3 * row..3 * row + 3]);
+        let base_color = (0..rows.len()).map(|row| rgb(row) * medium.untinted[row] * TINT).collect();
+        if local == Vec3::ZERO {
+            let none = vec![Vec3::ZERO; rows.len()];
+            return Ok(MediumRowsGrad { positions: none.clone(), normals: none, base_color });
+        }
+        // All channels see the same scalar irradiance; the cotangent goes to the first.
+        let d_own: Vec<f32> =
+            (0..rows.len()).flat_map(|row| [(rgb(row) * medium.tints[row]).dot(local), 0.0, 0.0]).collect();
+        let grad = Self::lighting(rows, lit, &lamp).pull(&d_own).map_err(error::stage("medium.pull"))?;
+        Ok(MediumRowsGrad { positions: grad.positions, normals: grad.normals, base_color })
+    }
+}
+
+/// The same light with intensity 1.
+pub(crate) fn white(light: &OlatLight) -> OlatLight {
+    match *light {
+        OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
+        OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
+    }
+}
+
+/// Thickness of a new Gaussian over its standard deviation along the surface.
+const SEED_FLATNESS: f32 = 0.2;
+/// Its opacity.
+const SEED_OPACITY: f32 = 0.9;
+
+impl Model {
+    /// Takes a medium in. The first one takes over from what has been learned of the light so far: base colours become neutral tints,
+    /// subsurfaceness whole, roughness the coat's, network and transfer vectors silent; and all of that learns anew. With `seeds` above 0 the
+    /// Gaussians are also replaced by about so many flat ones on the surface. Returns where each Gaussian comes from, if they are others now.
+    pub(crate) fn adopt_medium(
+        &mut self,
+        term: MediumTerm,
+        seeds: usize,
+    ) -> Result<Option<Vec<(u32, bool)>>, ReconstructError> {
+        let first = self.medium.is_none();
+        let roughness = term.medium().coat.roughness;
+        self.medium = Some(term);
+        if !first {
+            return Ok(None);
+        }
+        let sources = if seeds > 0 { Some(self.seed_from_surface(seeds)?) } else { None };
+        let fresh = [
+            (Attribute::BaseColor, 0.0),
+            (Attribute::Subsurfaceness, SUBSURFACENESS_LOGIT),
+            (Attribute::Roughness, logit(roughness.clamp(0.02, 0.98))),
+            (Attribute::Metalness, METALNESS_LOGIT),
+            (Attribute::Transfer, 0.0),
+        ];
+        for (attribute, value) in fresh {
+            let group = self.parameters.group_mut(attribute);
+            group.values.fill(value);
+            group.moments.first.fill(0.0);
+            group.moments.second.fill(0.0);
+        }
+        if let Some(network) = &mut self.network {
+            let head = &mut network.residual_head;
+            let last = head.shape.layer_offset(head.shape.layers() - 1);
+            head.parameters[last..].fill(0.0);
+            for moments in &mut self.network_moments {
+                moments.first.fill(0.0);
+                moments.second.fill(0.0);
+            }
+        }
+        Ok(sources)
+    }
+
+    fn seed_from_surface(&mut self, seeds: usize) -> Result<Vec<(u32, bool)>, ReconstructError> {
+        let (inset, seed_width) = (self.config.subsurface.inset, self.config.subsurface.seed_width);
+        let Some(term) = &mut self.medium else { return Ok(Vec::new()) };
+        let pieces = term.surface.cut(seeds).map_err(error::stage("surface"))?;
+        let means = self.parameters.activate().gaussians.means;
+        let spacing = term.surface.spacing();
+        let near = Near::new(&means, 2.0 * spacing);
+        let nearest = |at: Vec3| near.nearest(&means, at, 1).first().map_or(0, |f| f.0 as u32);
+        let sources: Vec<(u32, bool)> = pieces.iter().map(|p| (nearest(p.position), false)).collect();
+        let mut parameters = self.parameters.gather(&sources);
+        for (i, piece) in pieces.iter().enumerate() {
+            let width = seed_width * piece.area.sqrt();
+            let position = piece.position - piece.normal * (inset * width);
+            parameters.row_mut(Attribute::Mean, i).copy_from_slice(&position.to_array());
+            parameters.row_mut(Attribute::Normal, i).copy_from_slice(&piece.normal.to_array());
+            parameters.row_mut(Attribute::Opacity, i)[0] = logit(SEED_OPACITY);
+            let rotation = Quat::from_rotation_arc(Vec3::Z, piece.normal);
+            parameters.set_covariance(i, Vec3::new(width, width, width * SEED_FLATNESS), rotation);
+        }
+        self.parameters = parameters;
+        let (positions, normals): (Vec<Vec3>, Vec<Vec3>) = pieces.iter().map(|p| (p.position, p.normal)).unzip();
+        term.attachment = term.surface.attach(&positions, &normals);
+        Ok(sources)
+    }
+}
