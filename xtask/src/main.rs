@@ -7,7 +7,7 @@ use xtask::oracle::{self, OracleKind};
 use xtask::{captures, eval, fixtures, suite, tidy, tune};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
-const BENCHES: [&str; 2] = ["splat", "transport"];
+const BENCHES: [&str; 3] = ["splat", "transport", "prior"];
 
 const EXAMPLES: &str = "\
 Examples:

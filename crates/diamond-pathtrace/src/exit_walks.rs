@@ -32,10 +32,10 @@
 //! # Ok::<(), diamond_pathtrace::PathtraceError>(())
 //! ```
 mod angular;
-mod moments;
+pub(crate) mod moments;
 mod operator;
-mod surfel_grid;
-mod walker;
+pub(crate) mod surfel_grid;
+pub(crate) mod walker;
 
 pub use angular::AngularExit;
 pub use moments::ExitMoments;
@@ -237,7 +237,7 @@ impl ExitWalks {
 }
 
 /// αⁿ for n = 0 … count − 1.
-fn powers(albedo: f64, count: usize) -> Vec<f64> {
+pub(crate) fn powers(albedo: f64, count: usize) -> Vec<f64> {
     let mut power = 1.0f64;
     (0..count)
         .map(|_| {

@@ -44,6 +44,7 @@ mod mesh;
 mod mesh_geometry;
 mod noise;
 mod obj;
+mod patch_interpolation;
 mod patches;
 mod path;
 mod ply;
@@ -57,6 +58,7 @@ pub mod sampling;
 mod scene;
 mod sobol;
 mod triangle;
+mod view_walks;
 
 pub use boundary::{Boundary, BoundarySample};
 pub use bulk::{Bulk, BulkError, BulkOptions, BulkView, ReferencePair, measure_bulk, reference_pairs};
@@ -72,6 +74,7 @@ pub use medium::{Flight, FreeFlight, MAX_MEAN_COSINE, Medium, henyey_greenstein,
 pub use mesh::{MAX_COORDINATE, Mesh};
 pub use mesh_geometry::MeshGeometry;
 pub use obj::{parse_obj, read_obj};
+pub use patch_interpolation::PatchInterpolation;
 pub use patches::Patch;
 pub use path::{PathEnd, PathOptions, Tracer};
 pub use ply::{parse_ply, read_ply};
@@ -81,3 +84,4 @@ pub use repair::{RepairOptions, RepairReport};
 pub use rng::Rng;
 pub use sampling::Frame;
 pub use scene::{Material, Scene};
+pub use view_walks::{RadianceMoments, ViewWalkOptions, ViewWalks, WalkStart};

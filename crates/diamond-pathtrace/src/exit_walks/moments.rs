@@ -41,18 +41,39 @@ impl ExitMoments {
     }
 }
 
-impl ExitWalks {
-    /// Last number of scatterings of each bin that walks of this object need.
-    fn bins(&self) -> Vec<u32> {
-        let most = self.histogram.len().saturating_sub(1).max(1) as u32;
-        let mut ends: Vec<u32> = (1..=SINGLE).collect();
-        while ends.last().is_some_and(|end| *end < most) {
-            let last = ends.last().map_or(1, |end| *end);
-            ends.push((f64::from(last) * RATIO).ceil() as u32);
-        }
-        ends
-    }
+/// Bins of numbers of scatterings.
+#[derive(Debug, Clone)]
+pub(crate) struct Bins {
+    /// Last number of each.
+    pub ends: Vec<u32>,
+    /// Mean number in each.
+    pub exponents: Vec<f32>,
+    /// Which one holds a number.
+    pub of: Vec<u32>,
+}
 
+impl Bins {
+    /// For a histogram of numbers of scatterings, from 0 on; 0 itself is not wanted.
+    pub fn new(histogram: &[f64]) -> Self {
+        let most = histogram.len().saturating_sub(1).max(1) as u32;
+        let mut ends: Vec<u32> = (1..=SINGLE.min(most)).collect();
+        while let Some(last) = ends.last().filter(|end| **end < most) {
+            ends.push((f64::from(*last) * RATIO).ceil() as u32);
+        }
+        let of: Vec<u32> = (0..=most).map(|n| ends.partition_point(|end| *end < n) as u32).collect();
+        let mut sums = vec![(0.0f64, 0.0f64); ends.len()];
+        for (n, h) in histogram.iter().enumerate().skip(1) {
+            let bin = &mut sums[of[n] as usize];
+            bin.0 += h * n as f64;
+            bin.1 += h;
+        }
+        let mean = |((sum, count), end): (&(f64, f64), &u32)| if *count > 0.0 { sum / count } else { f64::from(*end) };
+        let exponents = sums.iter().zip(&ends).map(mean).map(|n| n as f32).collect();
+        Self { ends, exponents, of }
+    }
+}
+
+impl ExitWalks {
     /// What every surfel gets under every light from walks of each bin of scatterings: what a fit of the albedo reads. Arguments as in
     /// [`ExitWalks::radiosity`].
     ///
@@ -60,21 +81,8 @@ impl ExitWalks {
     /// `[eq:exit-moments]`
     pub fn moments(&self, irradiance: &[f32], cosines: &[f32]) -> Result<ExitMoments, PathtraceError> {
         let lights = lights(self.surfels(), irradiance, cosines)?;
-        let ends = self.bins();
-        let bins = ends.len();
-        let bin_of: Vec<u32> = (0..=u32::from(u16::MAX).min(ends[bins - 1]))
-            .map(|n| ends.partition_point(|end| *end < n) as u32)
-            .collect();
-        let mut exponents = vec![(0.0f64, 0.0f64); bins];
-        for (n, h) in self.histogram.iter().enumerate().skip(1) {
-            let bin = &mut exponents[bin_of[n] as usize];
-            bin.0 += h * n as f64;
-            bin.1 += h;
-        }
-        let exponents = exponents
-            .iter()
-            .zip(&ends)
-            .map(|((sum, count), end)| if *count > 0.0 { sum / count } else { f64::from(*end) });
+        let bins = Bins::new(&self.histogram);
+        let count = bins.ends.len();
         // Light as it enters, for each class of walks.
         let entering: Vec<Vec<f32>> = self
             .angular
@@ -82,19 +90,19 @@ impl ExitWalks {
             .map(|a| irradiance.iter().zip(cosines).map(|(e, mu)| e * a.at(*mu)).collect())
             .collect();
         let scale = 1.0 / self.options.walks as f32;
-        let mut values = vec![0.0f32; self.surfels() * lights * bins];
-        values.par_chunks_exact_mut(lights * bins).with_min_len(16).enumerate().for_each(|(k, h)| {
+        let mut values = vec![0.0f32; self.surfels() * lights * count];
+        values.par_chunks_exact_mut(lights * count).with_min_len(16).enumerate().for_each(|(k, h)| {
             let (exits, scatterings) = self.row(k);
             for (surfel, n) in exits.iter().zip(scatterings) {
-                let (bin, class) = (bin_of[usize::from(*n)] as usize, class_of(u32::from(*n)));
+                let (bin, class) = (bins.of[usize::from(*n)] as usize, class_of(u32::from(*n)));
                 let from = &entering[class][*surfel as usize * lights..][..lights];
-                h[bin..].iter_mut().step_by(bins).zip(from).for_each(|(h, e)| *h += scale * e);
+                h[bin..].iter_mut().step_by(count).zip(from).for_each(|(h, e)| *h += scale * e);
             }
         });
         Ok(ExitMoments {
-            exponents: exponents.map(|n| n as f32).collect(),
+            exponents: bins.exponents,
             values,
-            class: ends.iter().map(|end| class_of(*end) as u8).collect(),
+            class: bins.ends.iter().map(|end| class_of(*end) as u8).collect(),
             angular: self.angular.to_vec(),
         })
     }
@@ -102,7 +110,7 @@ impl ExitWalks {
     /// The largest error of [`ExitMoments`]' exponents at an albedo 0 … 1, relative to all light that leaves, for the walks as they are.
     pub fn moment_error(&self, albedo: f32) -> Result<f64, PathtraceError> {
         check("albedo", albedo, "a number from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
-        let ends = self.bins();
+        let Bins { ends, .. } = Bins::new(&self.histogram);
         let powers = powers(f64::from(albedo), self.histogram.len());
         let (mut error, mut total) = (0.0, 0.0);
         let mut first = 0usize;

@@ -21,25 +21,26 @@ pub(crate) struct SurfelGrid {
     places: Vec<(Vec3, Vec3)>,
 }
 
+/// `Ok` for at least one patch, all of them finite.
+pub(crate) fn check_patches(patches: &[Patch]) -> Result<(), PathtraceError> {
+    let sound = |p: &Patch| {
+        let unit = (p.normal.length_squared() - 1.0).abs() < 1e-3;
+        p.position.is_finite() && unit && p.area > 0.0 && p.area.is_finite()
+    };
+    let bad = patches.iter().position(|p| !sound(p));
+    if bad.is_none() && !patches.is_empty() && u32::try_from(patches.len()).is_ok() {
+        return Ok(());
+    }
+    Err(PathtraceError::Shape {
+        what: "patches",
+        expected: "at least one, fewer than 2³², finite, with unit normals and areas > 0".into(),
+        found: bad.map_or_else(|| format!("{}", patches.len()), |k| format!("{:?} at index {k}", patches[k])),
+    })
+}
+
 impl SurfelGrid {
     pub fn new(patches: &[Patch]) -> Result<Self, PathtraceError> {
-        let bad = |k: usize| PathtraceError::Shape {
-            what: "patches of walks",
-            expected: "at least one, fewer than 2³², finite, with unit normals and areas > 0".into(),
-            found: patches.get(k).map_or("none".into(), |p| format!("{p:?} at index {k}")),
-        };
-        let sound = |p: &Patch| {
-            p.position.is_finite()
-                && (p.normal.length_squared() - 1.0).abs() < 1e-3
-                && p.area > 0.0
-                && p.area.is_finite()
-        };
-        if let Some(k) = patches.iter().position(|p| !sound(p)) {
-            return Err(bad(k));
-        }
-        if patches.is_empty() || u32::try_from(patches.len()).is_err() {
-            return Err(bad(0));
-        }
+        check_patches(patches)?;
         let low = patches.iter().fold(Vec3::INFINITY, |a, p| a.min(p.position));
         let high = patches.iter().fold(Vec3::NEG_INFINITY, |a, p| a.max(p.position));
         let area: f64 = patches.iter().map(|p| f64::from(p.area)).sum();

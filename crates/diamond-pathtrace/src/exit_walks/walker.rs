@@ -55,10 +55,26 @@ enum End {
 }
 
 /// What happens at a boundary.
-enum Passage {
+pub(crate) enum Passage {
     Reflected(Vec3),
     Transmitted(Vec3),
     Absorbed,
+}
+
+/// The boundary (as [`Boundary::effective`] says), for a walk that arrived with `outgoing` (unit, back along the walk). What is not
+/// carried on ends by chance, so that walks stay whole: energy passes with probability, not with a weight.
+#[inline]
+pub(crate) fn pass(boundary: Boundary, outgoing: Vec3, normal: Vec3, rng: &mut Rng) -> Passage {
+    if boundary == Boundary::IndexMatched {
+        return Passage::Transmitted(-outgoing);
+    }
+    let Some(sample) = boundary.sample(outgoing, normal, rng) else { return Passage::Absorbed };
+    // 1 but for the masking of rough boundaries.
+    let energy = sample.weight * sample.energy_scale;
+    if energy < 1.0 && rng.uniform() >= energy {
+        return Passage::Absorbed;
+    }
+    if sample.transmitted { Passage::Transmitted(sample.direction) } else { Passage::Reflected(sample.direction) }
 }
 
 impl Walker<'_> {
@@ -75,7 +91,7 @@ impl Walker<'_> {
             let (sin, cos) = (TAU * v).sin_cos();
             let cos_start = (1.0 - u).sqrt();
             let outward = frame.to_world(Vec3::new(u.sqrt() * cos, u.sqrt() * sin, cos_start));
-            let Passage::Transmitted(direction) = self.pass(outward, normal, &mut rng) else {
+            let Passage::Transmitted(direction) = pass(self.boundary, outward, normal, &mut rng) else {
                 walked.refused += 1;
                 continue;
             };
@@ -100,22 +116,6 @@ impl Walker<'_> {
             Some(hit) if hit.normal.dot(patch.normal) > 0.5 => (hit.position, hit.normal, hit.primitive),
             _ => (patch.position, patch.normal, NO_PRIMITIVE),
         }
-    }
-
-    /// The boundary, for a walk that arrived with `outgoing` (unit, back along the walk). What is not carried on ends by chance, so that
-    /// walks stay whole: energy passes with probability, not with a weight.
-    #[inline]
-    fn pass(&self, outgoing: Vec3, normal: Vec3, rng: &mut Rng) -> Passage {
-        if self.boundary == Boundary::IndexMatched {
-            return Passage::Transmitted(-outgoing);
-        }
-        let Some(sample) = self.boundary.sample(outgoing, normal, rng) else { return Passage::Absorbed };
-        // 1 but for the masking of rough boundaries.
-        let energy = sample.weight * sample.energy_scale;
-        if energy < 1.0 && rng.uniform() >= energy {
-            return Passage::Absorbed;
-        }
-        if sample.transmitted { Passage::Transmitted(sample.direction) } else { Passage::Reflected(sample.direction) }
     }
 
     fn walk(&self, p: &mut State, rng: &mut Rng, walked: &mut Walked) -> End {
@@ -150,7 +150,7 @@ impl Walker<'_> {
     /// The walk meets the surface from inside; `None` if it is inside again afterwards.
     #[inline]
     fn surface(&self, p: &mut State, mut hit: Hit, rng: &mut Rng, walked: &mut Walked) -> Option<End> {
-        let direction = match self.pass(-p.direction, hit.normal, rng) {
+        let direction = match pass(self.boundary, -p.direction, hit.normal, rng) {
             Passage::Absorbed => return Some(End::Lost),
             Passage::Reflected(direction) => {
                 (p.origin, p.direction, p.skip) = (hit.position, direction, hit.primitive);
@@ -174,7 +174,7 @@ impl Walker<'_> {
                 self.geometry.closest_hit(hit.position, p.direction, f32::INFINITY, Facing::Entering, hit.primitive);
             let Some(next) = next else { return Some(End::Left) };
             hit = next;
-            match self.pass(-p.direction, hit.normal, rng) {
+            match pass(self.boundary, -p.direction, hit.normal, rng) {
                 Passage::Absorbed => return Some(End::Lost),
                 Passage::Reflected(direction) => p.direction = direction,
                 Passage::Transmitted(direction) => {
