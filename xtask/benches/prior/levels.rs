@@ -1,7 +1,7 @@
 //! Pictures by each level of the physical prior.
 use super::scenes::{ALBEDO, Case, Film, LAMPS, SIDE, Truth};
 use diamond_pathtrace::{
-    Bulk, BulkOptions, ExitWalkOptions, ExitWalks, Geometry, Patch, ViewWalkOptions, ViewWalks, WalkStart,
+    Bulk, BulkOptions, ExitWalkOptions, ExitWalks, Geometry, Patch, Scene, ViewWalkOptions, ViewWalks, WalkStart,
 };
 use diamond_shading::{
     Balance, NormalEquations, NormalizedDiffusion, RadialProfile, SolveOptions, SurfelTransport, Surfels,
@@ -21,56 +21,21 @@ fn pictures(channels: &[Vec<f32>; 3]) -> Pictures {
     (0..LIGHTS).map(|l| (0..PIXELS).flat_map(|i| (0..3).map(move |c| value(l, i, c))).collect()).collect()
 }
 
-/// How angles are treated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Angles {
-    /// As if the surface were ideally diffuse.
-    Diffuse,
-    /// One function at each albedo.
-    One,
-    /// One for each class of numbers of scatterings.
-    Classes,
-}
-
-/// Level 2, with the true medium.
-pub fn walk(case: &Case, film: &Film, options: &ExitWalkOptions, angles: Angles) -> Result<Pictures, String> {
-    let medium = case.scene.material.medium;
-    let boundary = case.scene.material.boundary;
+/// Level 2 as a matrix from patches to patches, with the true medium.
+pub fn operator(case: &Case, film: &Film, walks: u32) -> Result<Pictures, String> {
     let error = |e: diamond_pathtrace::PathtraceError| e.to_string();
-    let walks =
-        ExitWalks::trace(&case.scene.geometry, medium.sigma_t.x, medium.g, boundary, &case.patches, options, &|_| ())
-            .map_err(error)?;
+    let material = case.scene.material;
+    let (sigma_t, g) = (material.medium.sigma_t.x, material.medium.g);
+    let options = ExitWalkOptions { walks, ..Default::default() };
+    let geometry = &case.scene.geometry;
+    let walks = ExitWalks::trace(geometry, sigma_t, g, material.boundary, &case.patches, &options, &|_| ());
+    let walks = walks.map_err(error)?;
     let (irradiance, cosines) = case.light();
     let mut channels = [const { Vec::new() }; 3];
-    match angles {
-        Angles::Diffuse | Angles::One => {
-            for (c, channel) in channels.iter_mut().enumerate() {
-                let operator = walks.collapse(ALBEDO[c]).map_err(error)?;
-                if angles == Angles::Diffuse {
-                    let m = operator.apply(&irradiance, LIGHTS).map_err(error)?;
-                    *channel = film.develop(&m, LIGHTS, |_| FRAC_1_PI);
-                } else {
-                    let m = operator.radiosity(&irradiance, &cosines).map_err(error)?;
-                    *channel = film.develop(&m, LIGHTS, |mu| operator.angular.at(mu) * FRAC_1_PI);
-                }
-            }
-        }
-        Angles::Classes => {
-            let moments = walks.moments(&irradiance, &cosines).map_err(error)?;
-            let bins = moments.exponents.len();
-            for (c, channel) in channels.iter_mut().enumerate() {
-                *channel = vec![0.0; PIXELS * LIGHTS];
-                let powers: Vec<f32> = moments.exponents.iter().map(|n| ALBEDO[c].powf(*n)).collect();
-                for (class, angular) in moments.angular.iter().enumerate() {
-                    let of_class = |h: &[f32]| -> f32 {
-                        (0..bins).filter(|b| usize::from(moments.class[*b]) == class).map(|b| h[b] * powers[b]).sum()
-                    };
-                    let m: Vec<f32> = moments.values.chunks_exact(bins).map(of_class).collect();
-                    let part = film.develop(&m, LIGHTS, |mu| angular.at(mu) * FRAC_1_PI);
-                    channel.iter_mut().zip(part).for_each(|(sum, v)| *sum += v);
-                }
-            }
-        }
+    for (c, channel) in channels.iter_mut().enumerate() {
+        let operator = walks.collapse(ALBEDO[c]).map_err(error)?;
+        let m = operator.radiosity(&irradiance, &cosines).map_err(error)?;
+        *channel = film.develop(&m, LIGHTS, |mu| operator.angular.at(mu) * FRAC_1_PI);
     }
     Ok(pictures(&channels))
 }
@@ -182,10 +147,23 @@ pub fn profile(case: &Case, film: &Film, truth: &Truth, which: Profile, widths: 
     Ok(pictures(&channels))
 }
 
-/// The bulk renderer.
-pub fn bulk(case: &Case, options: &BulkOptions) -> Result<Pictures, String> {
-    let error = |e: diamond_pathtrace::PathtraceError| e.to_string();
-    let solved = Bulk::solve(&case.scene, options, &|_| ()).map_err(error)?;
-    let view = solved.render(&case.camera, 0).map_err(error)?;
-    Ok(view.lights.iter().map(|l| l.data().to_vec()).collect())
+/// The bulk renderer, without what the boundary reflects on its outer side.
+pub fn bulk(case: &Case, walks: u32) -> Result<Pictures, String> {
+    let options = BulkOptions { points: 2000, walks, ..Default::default() };
+    let render = |scene: &Scene, options: &BulkOptions| -> Result<Pictures, String> {
+        let error = |e: diamond_pathtrace::PathtraceError| e.to_string();
+        let solved = Bulk::solve(scene, options, &|_| ()).map_err(error)?;
+        let view = solved.render(&case.camera, 0).map_err(error)?;
+        Ok(view.lights.iter().map(|l| l.data().to_vec()).collect())
+    };
+    let mut pictures = render(&case.scene, &options)?;
+    if case.refracts() {
+        let mut black = case.scene.clone();
+        black.material.medium.albedo = Vec3::ZERO;
+        let surface = render(&black, &BulkOptions { walks: 1, points: 16, ..options })?;
+        for (picture, surface) in pictures.iter_mut().zip(&surface) {
+            picture.iter_mut().zip(surface).for_each(|(p, s)| *p -= s);
+        }
+    }
+    Ok(pictures)
 }

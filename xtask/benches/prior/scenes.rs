@@ -3,7 +3,7 @@ use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_image::Image;
 use diamond_pathtrace::{
     Boundary, Facing, Geometry, Light, Material, Medium, Mesh, NO_PRIMITIVE, Patch, PatchInterpolation,
-    ReferenceOptions, Scene, read_ply, render_reference,
+    ReferenceOptions, Scene, WalkStart, read_ply, render_reference,
 };
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -24,7 +24,6 @@ pub const ALBEDO: Vec3 = Vec3::new(0.99, 0.95, 0.7);
 
 /// An object of one medium.
 pub struct Case {
-    pub name: &'static str,
     pub scene: Scene,
     pub patches: Vec<Patch>,
     pub camera: Camera,
@@ -67,11 +66,12 @@ impl Case {
         let eye = if matches!(name, "slab" | "sheet") { Vec3::new(1.6, 1.2, 2.9) } else { Vec3::new(0.8, 0.7, 3.3) };
         let pose = Pose::look_at(eye, Vec3::ZERO, Vec3::Y);
         let camera = Camera { intrinsics: Intrinsics::from_fov_x(0.6, SIDE, SIDE), pose };
-        Ok(Self { name, scene, patches, camera })
+        Ok(Self { scene, patches, camera })
     }
 
-    pub fn sigma_t(&self) -> f32 {
-        self.scene.material.medium.sigma_t.x
+    /// Whether its boundary is one.
+    pub fn refracts(&self) -> bool {
+        self.scene.material.boundary.effective() != Boundary::IndexMatched
     }
 
     /// Irradiance of every patch under every lamp, shadows by rays, and the cosines: patches × lamps.
@@ -101,7 +101,7 @@ impl Case {
             variances: all.lights.iter().map(|l| squared(&l.standard_error)).collect(),
             coverage: all.coverage,
         };
-        if self.scene.material.boundary.effective() != Boundary::IndexMatched {
+        if self.refracts() {
             // What the boundary reflects on its outer side, which a black medium shows alone.
             let mut black = self.scene.clone();
             black.material.medium.albedo = Vec3::ZERO;
@@ -132,7 +132,10 @@ impl Case {
                 if let Some(hit) = hit {
                     let mut weights = Vec::new();
                     between.weights(hit.position, hit.normal, &mut weights);
-                    rays.push(FilmRay { cos: -ray.direction.dot(hit.normal), weights });
+                    let cos = -ray.direction.dot(hit.normal);
+                    let direction = Some(-ray.direction);
+                    let start = WalkStart { position: hit.position, normal: hit.normal, direction };
+                    rays.push(FilmRay { cos, start, weights });
                 }
             }
             rays
@@ -159,6 +162,7 @@ pub struct Truth {
 pub struct FilmRay {
     /// Outer cosine.
     pub cos: f32,
+    pub start: WalkStart,
     pub weights: Vec<(u32, f32)>,
 }
 
@@ -168,6 +172,17 @@ pub struct Film {
 }
 
 impl Film {
+    /// Up to four rays of each pixel, with its number and what of it each stands for.
+    pub fn starts(&self) -> (Vec<WalkStart>, Vec<(usize, f32)>) {
+        let some = |(pixel, rays): (usize, &Vec<FilmRay>)| {
+            let step = rays.len().div_ceil(4).max(1);
+            let chosen: Vec<WalkStart> = rays.iter().skip(step / 2).step_by(step).map(|r| r.start).collect();
+            let share = rays.len() as f32 / (RAYS * RAYS) as f32 / chosen.len().max(1) as f32;
+            chosen.into_iter().map(move |start| (start, (pixel, share)))
+        };
+        self.pixels.iter().enumerate().flat_map(some).unzip()
+    }
+
     /// Pictures of `columns` values of each patch (patches × columns): SIDE² × columns, each ray's value times `factor` of its cosine.
     pub fn develop(&self, values: &[f32], columns: usize, factor: impl Fn(f32) -> f32 + Sync) -> Vec<f32> {
         self.pixels
