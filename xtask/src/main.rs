@@ -7,7 +7,7 @@ use xtask::oracle::{self, OracleKind};
 use xtask::{captures, eval, fixtures, suite, tidy, tune};
 
 /// The benchmarks that exist: targets of this package, compiled with optimisation.
-const BENCHES: [&str; 2] = ["splat", "transport"];
+const BENCHES: [&str; 3] = ["splat", "transport", "prior"];
 
 const EXAMPLES: &str = "\
 Examples:
@@ -16,6 +16,7 @@ Examples:
   cargo xtask oracle splat scenes/dense_1000.npz    one splat scene
   cargo xtask bench splat                           time and error of the rasteriser
   cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
+  cargo xtask bench prior                           levels of the physical prior against the path tracer
   cargo xtask eval out/grid.toml --print            the commands of a grid of reconstructions that are not done
   cargo xtask tune out/tune.toml                    search settings on training images that are held out
   cargo xtask tidy --rules                          the house rules and their reasons
@@ -55,7 +56,7 @@ enum Tool {
         #[arg(long)]
         full: bool,
     },
-    /// Measure run time and error: `cargo xtask bench splat`, `cargo xtask bench transport`.
+    /// Measure run time and error: `cargo xtask bench splat`, `cargo xtask bench transport`, `cargo xtask bench prior`.
     Bench {
         /// What to measure.
         #[arg(value_parser = BENCHES)]

@@ -27,13 +27,13 @@
 //! assert!(view.lights[0].pixel(4, 4)[0] > view.lights[1].pixel(4, 4)[0]);
 //! # Ok::<(), diamond_pathtrace::PathtraceError>(())
 //! ```
-mod directions;
-mod lamps;
-mod light_map;
+pub(crate) mod directions;
+pub(crate) mod lamps;
+pub(crate) mod light_map;
 mod matched;
 mod measure;
-mod points;
-mod refracting;
+pub(crate) mod points;
+pub(crate) mod refracting;
 mod render;
 
 pub use measure::{BulkError, ReferencePair, measure_bulk, reference_pairs};
@@ -136,15 +136,8 @@ impl<'a> Bulk<'a> {
         scene.geometry.validate()?;
         scene.material.validate()?;
         scene.lights.iter().try_for_each(crate::Light::validate)?;
-        let lamps = Lamps::new(scene)?;
-        for l in 0..lamps.len() {
-            if lamps.position(l).is_some_and(|at| scene.geometry.contains(at)) {
-                return Err(PathtraceError::Unreachable {
-                    light: l,
-                    reason: "it stands inside the object, where the bulk renderer connects nothing; use the reference",
-                });
-            }
-        }
+        let lamps = Lamps::new(&scene.lights)?;
+        lamps.check_outside(&scene.geometry)?;
         let points = SurfacePoints::new(&scene.geometry, options.points as usize, options.seed)?;
         let cone = Cone::new(scene.material.boundary);
         let side = if cone.is_some() { 0 } else { options.visibility };

@@ -7,7 +7,7 @@ const LEFT: f64 = 56.0;
 const RIGHT: f64 = 16.0;
 const TOP: f64 = 30.0;
 const BOTTOM: f64 = 44.0;
-const COLOURS: [&str; 3] = ["#1f5fa8", "#b8451f", "#3a7d44"];
+const COLOURS: [&str; 6] = ["#1f5fa8", "#b8451f", "#3a7d44", "#8a5aa8", "#a8871f", "#555555"];
 
 /// A line of points (x, y), each with a word beside it.
 pub struct Curve {

@@ -1,11 +1,11 @@
 //! The lights of a rig as the bulk renderer uses them: points and directions, one colour each, and a factor that depends on the place.
 //!
 //! Irradiance is `factor · colour`, so that everything up to the finished picture is one number for each light.
-use crate::{Light, PathtraceError, Scene};
+use crate::{Geometry, Light, PathtraceError};
 use diamond_light::{Falloff, OlatLight};
 use glam::Vec3;
 
-/// The lights of a scene.
+/// The lights of a rig.
 #[derive(Debug, Clone)]
 pub(crate) struct Lamps {
     lamps: Vec<(OlatLight, Falloff)>,
@@ -29,9 +29,9 @@ const MIN_DISTANCE: f32 = 1e-4;
 
 impl Lamps {
     /// `Err` for lights that have an extent.
-    pub fn new(scene: &Scene) -> Result<Self, PathtraceError> {
+    pub fn new(lights: &[Light]) -> Result<Self, PathtraceError> {
         let mut lamps = Vec::new();
-        for (i, light) in scene.lights.iter().enumerate() {
+        for (i, light) in lights.iter().enumerate() {
             let Light::Olat { light, falloff } = light else {
                 return Err(PathtraceError::Unreachable {
                     light: i,
@@ -42,6 +42,17 @@ impl Lamps {
         }
         let colours = lamps.iter().map(|(light, _)| light.intensity()).collect();
         Ok(Self { lamps, colours })
+    }
+
+    /// `Err` where one stands inside the object.
+    pub fn check_outside(&self, geometry: &Geometry) -> Result<(), PathtraceError> {
+        match (0..self.len()).find(|l| self.position(*l).is_some_and(|at| geometry.contains(at))) {
+            None => Ok(()),
+            Some(light) => Err(PathtraceError::Unreachable {
+                light,
+                reason: "it stands inside the object, where the bulk renderer connects nothing; use the reference",
+            }),
+        }
     }
 
     /// Number of lights.

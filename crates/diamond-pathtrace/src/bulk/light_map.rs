@@ -256,7 +256,7 @@ mod tests {
         ];
         let material = Material::index_matched(Medium::gray(1.0, 0.5, 0.0));
         let scene = Scene { geometry: geometry.clone(), material, lights };
-        let lamps = Lamps::new(&scene).unwrap();
+        let lamps = Lamps::new(&scene.lights).unwrap();
         let (traced, _) = LightMaps::new(&geometry, &lamps, 0).error(&lamps, 200);
         let (coarse, _) = LightMaps::new(&geometry, &lamps, 32).error(&lamps, 2000);
         let (fine, worst) = LightMaps::new(&geometry, &lamps, 256).error(&lamps, 2000);

@@ -3,7 +3,8 @@
 //! Points are uniform by area and keep a distance from each other (dart throwing). Between them, values are fitted by moving least
 //! squares: a linear function of the place in the tangent plane, weighted towards near points of like orientation. It reproduces
 //! constants and slopes, so its error is that of curvature.
-use crate::{Geometry, Mesh, PathtraceError, Rng, sampling::uniform_sphere};
+use crate::geometry::NO_PRIMITIVE;
+use crate::{Geometry, Mesh, Patch, PathtraceError, Rng, sampling::uniform_sphere};
 use glam::{DVec3, Vec3};
 
 /// Neighbours within this many spacings are used.
@@ -149,14 +150,48 @@ impl SurfacePoints {
                 points.push(point);
             }
         }
+        Ok(Self::sorted(points, spacing, low, per_cell, size, &cells))
+    }
+
+    /// Points that are given. Places are fitted from those within [`REACH`] times the root of the largest area.
+    pub fn of_patches(patches: &[Patch]) -> Self {
+        let largest = patches.iter().map(|p| p.area).fold(f32::MIN_POSITIVE, f32::max);
+        let spacing = largest.sqrt();
+        let low = patches.iter().fold(Vec3::INFINITY, |a, p| a.min(p.position));
+        let high = patches.iter().fold(Vec3::NEG_INFINITY, |a, p| a.max(p.position));
+        let per_cell = 1.0 / (REACH * spacing).max((high - low).max_element() / 512.0);
+        let size = ((high - low) * per_cell).to_array().map(|n| (n as usize + 1).min(512));
+        let point = |p: &Patch| SurfacePoint {
+            position: p.position,
+            normal: p.normal,
+            smooth_normal: p.normal,
+            primitive: NO_PRIMITIVE,
+        };
+        let points: Vec<SurfacePoint> = patches.iter().map(point).collect();
+        let mut cells: Vec<Vec<u32>> = vec![Vec::new(); size[0] * size[1] * size[2]];
+        for (k, point) in points.iter().enumerate() {
+            let [x, y, z] = cell_of(point.position, low, per_cell, size);
+            cells[(z * size[1] + y) * size[0] + x].push(k as u32);
+        }
+        Self::sorted(points, spacing, low, per_cell, size, &cells)
+    }
+
+    fn sorted(
+        points: Vec<SurfacePoint>,
+        spacing: f32,
+        low: Vec3,
+        per_cell: f32,
+        size: [usize; 3],
+        cells: &[Vec<u32>],
+    ) -> Self {
         let mut starts = Vec::with_capacity(cells.len() + 1);
         let mut members = Vec::with_capacity(points.len());
-        for cell in &cells {
+        for cell in cells {
             starts.push(members.len() as u32);
             members.extend(cell);
         }
         starts.push(members.len() as u32);
-        Ok(Self { points, spacing, low, per_cell, size, starts, members })
+        Self { points, spacing, low, per_cell, size, starts, members }
     }
 
     /// The points.

@@ -81,6 +81,19 @@ impl Cone {
         Some(Self { boundary, eta2: eta * eta, min_cos, mean_cos, passed, inverse: moments.inverse() })
     }
 
+    /// Whether light that meets the surface from inside along `direction` may have come in there against it.
+    #[inline]
+    pub fn holds(&self, direction: Vec3, normal: Vec3) -> bool {
+        direction.dot(normal) >= self.min_cos
+    }
+
+    /// What the entering moments are multiplied by for light that goes against the local direction.
+    #[inline]
+    pub fn kernel(&self, local: Vec3) -> [f32; CONE] {
+        let values = basis::<CONE>(local, 0.0);
+        std::array::from_fn(|k| self.inverse[k].iter().zip(&values).map(|(a, b)| a * b).sum())
+    }
+
     /// Of light from the unit direction `outside`: the fraction that passes, and the sum of its inner directions (reversed, so that they point
     /// outward), world.
     pub fn pass(&self, outside: Vec3, normal: Vec3) -> (f32, Vec3) {
@@ -108,6 +121,43 @@ fn cone_direction(min_cos: f32, u: Vec2) -> Vec3 {
     Vec3::new(sin2.sqrt() * cos, sin2.sqrt() * sin, (1.0 - sin2).max(0.0).sqrt())
 }
 
+/// Light that enters at each point: for each function of the direction, each light.
+pub(crate) fn entering(geometry: &Geometry, lamps: &Lamps, points: &SurfacePoints, cone: &Cone) -> Vec<f32> {
+    let rows: Vec<Vec<f32>> = points
+        .points()
+        .par_iter()
+        .map(|point| {
+            let lights = lamps.len();
+            let mut row = vec![0.0f32; CONE * lights];
+            let frame = Frame::new(point.smooth_normal);
+            for l in 0..lights {
+                let shine = lamps.shine(l, point.position);
+                let cos = shine.direction.dot(point.normal);
+                let blocked = || {
+                    geometry.occluded(
+                        point.position,
+                        shine.direction,
+                        shine.distance,
+                        Facing::Entering,
+                        point.primitive,
+                    )
+                };
+                if cos <= 0.0 || blocked() {
+                    continue;
+                }
+                let (passed, sum) = cone.pass(shine.direction, point.normal);
+                let local = carried(sum, point.normal, frame);
+                let received = shine.factor * cos;
+                for (b, m) in [passed, local.z, local.x, local.y].into_iter().enumerate() {
+                    row[b * lights + l] = received * m;
+                }
+            }
+            row
+        })
+        .collect();
+    rows.concat()
+}
+
 /// What walks need to know.
 pub(crate) struct RefractingWalks<'a> {
     pub geometry: &'a Geometry,
@@ -130,39 +180,8 @@ impl<'a> RefractingWalks<'a> {
         cone: &'a Cone,
         options: BulkOptions,
     ) -> Self {
-        let rows: Vec<Vec<f32>> = points
-            .points()
-            .par_iter()
-            .map(|point| {
-                let lights = lamps.len();
-                let mut row = vec![0.0f32; CONE * lights];
-                let frame = Frame::new(point.smooth_normal);
-                for l in 0..lights {
-                    let shine = lamps.shine(l, point.position);
-                    let cos = shine.direction.dot(point.normal);
-                    let blocked = || {
-                        geometry.occluded(
-                            point.position,
-                            shine.direction,
-                            shine.distance,
-                            Facing::Entering,
-                            point.primitive,
-                        )
-                    };
-                    if cos <= 0.0 || blocked() {
-                        continue;
-                    }
-                    let (passed, sum) = cone.pass(shine.direction, point.normal);
-                    let local = carried(sum, point.normal, frame);
-                    let received = shine.factor * cos;
-                    for (b, m) in [passed, local.z, local.x, local.y].into_iter().enumerate() {
-                        row[b * lights + l] = received * m;
-                    }
-                }
-                row
-            })
-            .collect();
-        Self { geometry, medium, lamps, points, cone, options, entering: rows.concat() }
+        let entering = entering(geometry, lamps, points, cone);
+        Self { geometry, medium, lamps, points, cone, options, entering }
     }
 
     /// Coefficients of the light under a point: for each function of the direction, each channel, each light.
@@ -269,17 +288,13 @@ impl<'a> RefractingWalks<'a> {
     /// `[eq:entering-light]`
     #[inline]
     fn connect(&self, at: Vec3, normal: Vec3, direction: Vec3, throughput: Vec3, gathered: &mut [f32]) -> bool {
-        if direction.dot(normal) < self.cone.min_cos {
+        if !self.cone.holds(direction, normal) {
             return false;
         }
         let k = self.points.nearest(at, normal) as usize;
         let frame = Frame::new(self.points.points()[k].smooth_normal);
-        let values = basis::<CONE>(carried(direction, normal, frame), 0.0);
+        let g = self.cone.kernel(carried(direction, normal, frame));
         let lights = self.lamps.len();
-        let mut g = [0.0f32; CONE];
-        for (g, row) in g.iter_mut().zip(&self.cone.inverse) {
-            *g = row.iter().zip(&values).map(|(a, b)| a * b).sum();
-        }
         let rows = &self.entering[k * CONE * lights..(k + 1) * CONE * lights];
         let (r0, rest) = rows.split_at(lights);
         let (r1, rest) = rest.split_at(lights);
