@@ -1,26 +1,63 @@
 //! The light that leaves the surfels of a surface under any lights, for a given medium.
 use crate::fit::{irradiance, normals_of, surfel_transport, white};
+use crate::walk_fit::{boundary, cosines};
 use crate::{Medium, MediumError, Surface, Transport};
 use diamond_light::{Falloff, OlatLight};
+use diamond_pathtrace::{ExitWalkOptions, ExitWalks, WalkOperator};
 use diamond_shading::{RadialProfile, SurfelTransport};
+use glam::Vec3;
+use std::f32::consts::PI;
+
+/// Walks from each surfel: their noise is averaged over the surfels around a place.
+const WALKS: u32 = 256;
+/// Scatterings after which a walk is cut off.
+const MAX_EVENTS: u32 = 20_000;
 
 /// Transport of a medium between the surfels of a surface, made once for all lights.
 #[derive(Debug)]
 pub struct Exitance {
-    profile: RadialProfile,
-    transport: SurfelTransport,
+    form: Form,
+}
+
+#[derive(Debug)]
+enum Form {
+    Profile { profile: RadialProfile, transport: Box<SurfelTransport> },
+    Walk { operators: [WalkOperator; 3], gain: Vec3 },
 }
 
 impl Exitance {
-    /// Prepares transport.
+    /// Prepares transport: for walks, traces them.
     pub fn new(surface: &Surface, medium: &Medium) -> Result<Self, MediumError> {
         medium.validate()?;
-        let profile = medium.profile()?;
-        let transport = surfel_transport(surface, profile.widths().to_vec())?;
-        Ok(Self { profile, transport })
+        let form = match &medium.transport {
+            Transport::Profile { .. } => {
+                let profile = medium.profile()?;
+                let transport = Box::new(surfel_transport(surface, profile.widths().to_vec())?);
+                Form::Profile { profile, transport }
+            }
+            Transport::Walk { sigma_t, albedo, g, ior, gain } => {
+                let options = ExitWalkOptions { walks: WALKS, max_events: MAX_EVENTS, seed: 0 };
+                let trace = |sigma: f32| {
+                    let (geometry, patches) = (surface.geometry(), surface.patches());
+                    ExitWalks::trace(geometry, sigma, *g, boundary(*ior), patches, &options, &|_| ())
+                };
+                let mut walks: Vec<(f32, ExitWalks)> = Vec::new();
+                for sigma in sigma_t {
+                    if !walks.iter().any(|w| w.0 == *sigma) {
+                        walks.push((*sigma, trace(*sigma)?));
+                    }
+                }
+                let of = |c: usize| {
+                    let found = walks.iter().find(|w| w.0 == sigma_t[c]).map(|w| w.1.collapse(albedo[c]));
+                    found.unwrap_or_else(|| trace(sigma_t[c])?.collapse(albedo[c]))
+                };
+                Form::Walk { operators: [of(0)?, of(1)?, of(2)?], gain: Vec3::from(*gain) }
+            }
+        };
+        Ok(Self { form })
     }
 
-    /// Radiance that leaves each surfel in any direction under each light with intensity 1: for each light surfels × 3, linear RGB.
+    /// Radiance that leaves each surfel under each light with intensity 1, averaged over directions: for each light surfels × 3, linear RGB.
     pub fn under(
         &self,
         surface: &Surface,
@@ -29,24 +66,51 @@ impl Exitance {
     ) -> Result<Vec<Vec<f32>>, MediumError> {
         let lamps: Vec<OlatLight> = lights.iter().map(white).collect();
         let entering = irradiance(surface, surface.positions(), &normals_of(surface), &lamps, falloff)?;
-        let coloured: Vec<f32> = entering.iter().flat_map(|e| [*e; 3]).collect();
-        let receivers = self.transport.receivers(surface.positions())?;
-        let (out, _) = receivers.exitance(&self.profile, &coloured)?;
-        let n = lamps.len();
-        let each = (0..n).map(|l| {
-            let surfels = 0..surface.positions().len();
-            surfels.flat_map(|j| (0..3).map(move |c| (j, c))).map(|(j, c)| out[(j * n + l) * 3 + c] / std::f32::consts::PI).collect()
-        });
-        Ok(each.collect())
+        let (n, surfels) = (lamps.len(), surface.positions().len());
+        match &self.form {
+            Form::Profile { profile, transport } => {
+                let coloured: Vec<f32> = entering.iter().flat_map(|e| [*e; 3]).collect();
+                let (out, _) = transport.receivers(surface.positions())?.exitance(profile, &coloured)?;
+                let of = |l: usize| (0..surfels).flat_map(|j| out[(j * n + l) * 3..][..3].iter().map(|v| v / PI)).collect();
+                Ok((0..n).map(of).collect())
+            }
+            Form::Walk { operators, gain } => {
+                let cosines = cosines(surface, &lamps);
+                let mut out = vec![vec![0.0f32; 3 * surfels]; n];
+                for (c, operator) in operators.iter().enumerate() {
+                    let radiosity = operator.radiosity(&entering, &cosines)?;
+                    for (l, out) in out.iter_mut().enumerate() {
+                        (0..surfels).for_each(|j| out[3 * j + c] = gain[c] * radiosity[j * n + l] / PI);
+                    }
+                }
+                Ok(out)
+            }
+        }
+    }
+
+    /// Factor on the radiance of a surfel toward the outer cosine `mu`, 0 … 1: linear RGB; 1 for profiles.
+    #[inline]
+    pub fn toward(&self, mu: f32) -> Vec3 {
+        match &self.form {
+            Form::Profile { .. } => Vec3::ONE,
+            Form::Walk { operators, .. } => {
+                // Seen at the very edge as if a little before it, so that no normal turns a Gaussian black.
+                let mu = mu.max(MIN_COS_THETA_O);
+                Vec3::from(std::array::from_fn(|c| operators[c].angular.at(mu)))
+            }
+        }
     }
 }
 
+/// Least outer cosine at which exits are looked up.
+const MIN_COS_THETA_O: f32 = 0.1;
+
 impl Medium {
     /// The part that leaves where it enters, radiance per irradiance: linear RGB.
-    pub fn local(&self) -> glam::Vec3 {
+    pub fn local(&self) -> Vec3 {
         match &self.transport {
-            Transport::Profile { local, .. } => glam::Vec3::from(*local) / std::f32::consts::PI,
-            Transport::Walk { .. } => glam::Vec3::ZERO,
+            Transport::Profile { local, .. } => Vec3::from(*local) / PI,
+            Transport::Walk { .. } => Vec3::ZERO,
         }
     }
 }

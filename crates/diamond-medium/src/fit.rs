@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 /// Roughnesses at which the coat is offered.
 pub const COATS: [f32; 3] = [0.2, 0.35, 0.6];
 /// Values at and above this are full film: they only say that there was at least as much.
-const FULL: f32 = 0.995;
+pub(crate) const FULL: f32 = 0.995;
 /// Rounds of weighting.
 const ROUNDS: usize = 3;
 
@@ -75,12 +75,12 @@ struct Seen {
 }
 
 /// One photograph's pixels and what each unknown would show there.
-struct Rows<'a> {
+pub(crate) struct Rows<'a> {
     image: FitImage<'a>,
-    pixels: Vec<usize>,
+    pub pixels: Vec<usize>,
     /// pixels × (shared + coats), under a light of intensity 1.
-    values: Vec<f32>,
-    intensity: Vec3,
+    pub values: Vec<f32>,
+    pub intensity: Vec3,
 }
 
 /// Intensity or irradiance.
@@ -152,15 +152,15 @@ fn seen(surface: &Surface, image: &FitImage<'_>, stride: usize) -> Vec<Seen> {
 }
 
 /// What the photographs say, as columns of unknowns.
-struct Evidence<'a> {
-    rows: Vec<Rows<'a>>,
-    shared: usize,
+pub(crate) struct Evidence<'a> {
+    pub rows: Vec<Rows<'a>>,
+    pub shared: usize,
     coats: usize,
     unit: f32,
 }
 
 /// The lights of photographs, each once, and which photograph has which.
-fn lights_of(images: &[FitImage<'_>]) -> (Vec<OlatLight>, Vec<usize>) {
+pub(crate) fn lights_of(images: &[FitImage<'_>]) -> (Vec<OlatLight>, Vec<usize>) {
     let (mut lights, mut index, mut places) = (Vec::new(), Vec::new(), BTreeMap::new());
     for image in images {
         let place = *places.entry(key(image.light)).or_insert_with(|| {
@@ -172,12 +172,22 @@ fn lights_of(images: &[FitImage<'_>]) -> (Vec<OlatLight>, Vec<usize>) {
     (lights, index)
 }
 
+/// What surfels send out, before it is fitted.
+pub(crate) struct Columns<'c> {
+    /// Columns.
+    pub count: usize,
+    /// surfels × lights × columns: radiosity under lights of intensity 1.
+    pub values: &'c [f32],
+    /// Factor on each column toward the outer cosine, over π.
+    pub exit: &'c (dyn Fn(f32) -> Vec<f32> + Sync),
+}
+
 impl<'a> Evidence<'a> {
-    /// `surfels`: for each column that is shared, surfels × lights of radiosity under lights of intensity 1; a local column is added.
-    fn new(
+    /// A column of light that leaves where it enters is added.
+    pub(crate) fn new(
         surface: &Surface,
         images: &[FitImage<'a>],
-        columns: &[Vec<f32>],
+        columns: &Columns<'_>,
         index: &[usize],
         lights: usize,
         options: &FitOptions,
@@ -190,7 +200,7 @@ impl<'a> Evidence<'a> {
             / images.len().max(1) as f64;
         let stride = ((total as f64 * covered / options.pixels.max(1) as f64).ceil() as usize).max(1);
         let coats = if images.iter().any(|i| i.known.is_some()) { 0 } else { COATS.len() };
-        let shared = columns.len() + 1;
+        let shared = columns.count + 1;
         let brdf = BrdfModel::default();
         let rows = images.iter().zip(index).map(|(image, light)| -> Result<Rows<'a>, MediumError> {
             let places = seen(surface, image, stride);
@@ -202,13 +212,15 @@ impl<'a> Evidence<'a> {
             let width = shared + coats;
             let mut values = vec![0.0f32; width * places.len()];
             values.par_chunks_exact_mut(width).zip(&places).enumerate().for_each(|(n, (row, place))| {
-                for (column, out) in columns.iter().zip(row.iter_mut()) {
-                    let sum: f32 = attachment.of(n).map(|(j, w)| w * column[j * lights + light]).sum();
-                    *out = sum / std::f32::consts::PI;
+                for (j, weight) in attachment.of(n) {
+                    let from = &columns.values[(j * lights + light) * columns.count..][..columns.count];
+                    row.iter_mut().zip(from).for_each(|(to, v)| *to += weight * v);
                 }
+                let factors = (columns.exit)(place.shading.dot(place.toward_eye).max(0.0));
+                row.iter_mut().zip(factors).for_each(|(v, f)| *v *= f);
                 let arriving = lamp[0].incidence(place.position, options.falloff);
                 let lit = arriving.irradiance * visibility[n];
-                row[columns.len()] = lit.x * place.shading.dot(arriving.direction).max(0.0) / std::f32::consts::PI;
+                row[columns.count] = lit.x * place.shading.dot(arriving.direction).max(0.0) / std::f32::consts::PI;
                 for (out, roughness) in row[shared..].iter_mut().zip(COATS) {
                     let coat = Material { base_color: Vec3::ZERO, roughness, metalness: 0.0 };
                     *out = brdf.reflect(&coat, place.shading, place.toward_eye, arriving.direction, lit).x;
@@ -230,12 +242,12 @@ impl<'a> Evidence<'a> {
         3 * self.shared + self.coats
     }
 
-    fn width(&self) -> usize {
+    pub(crate) fn width(&self) -> usize {
         self.shared + self.coats
     }
 
     /// Channel `c` of pixel `n` of a photograph: factor of the shared columns, what is known, the photograph.
-    fn pixel(rows: &Rows<'_>, n: usize, c: usize) -> (f32, f32, f32) {
+    pub(crate) fn pixel(rows: &Rows<'_>, n: usize, c: usize) -> (f32, f32, f32) {
         let at = 3 * rows.pixels[n] + c;
         let of = |image: Option<&Image>, otherwise: f32| image.map_or(otherwise, |i| i.data()[at]);
         (of(rows.image.tint, 1.0), of(rows.image.known, 0.0), rows.image.radiance.data()[at])
@@ -297,7 +309,7 @@ impl<'a> Evidence<'a> {
     }
 
     /// How well `x` explains the photographs.
-    fn quality(&self, x: &[f64]) -> Quality {
+    pub(crate) fn quality(&self, x: &[f64]) -> Quality {
         let encode = |v: f32| Transfer::Srgb.encode(v.clamp(0.0, 1.0));
         let (mut squares, mut truth, mut count) = (0.0f64, 0.0f64, 0u64);
         // Differences of a pixel under all lights of its view, where there are several.
@@ -345,7 +357,7 @@ impl<'a> Evidence<'a> {
 }
 
 /// Slope of the sRGB curve between two values.
-fn slope(a: f32, b: f32) -> f32 {
+pub(crate) fn slope(a: f32, b: f32) -> f32 {
     if (a - b).abs() < 1e-3 {
         return Transfer::Srgb.encode_pull(0.5 * (a + b), 1.0);
     }
@@ -360,26 +372,42 @@ pub fn offered_widths(surface: &Surface, options: &FitOptions) -> Vec<f32> {
 
 /// Fits a profile and a coat to photographs.
 pub fn fit_profile(surface: &Surface, images: &[FitImage<'_>], options: &FitOptions) -> Result<Medium, MediumError> {
+    Ok(fit_profile_and_coats(surface, images, options)?.0)
+}
+
+/// [`fit_profile`], and the scale of the coat at each of [`COATS`] (none where the rest of the light is known).
+pub(crate) fn fit_profile_and_coats(
+    surface: &Surface,
+    images: &[FitImage<'_>],
+    options: &FitOptions,
+) -> Result<(Medium, Vec<f32>), MediumError> {
     let (lights, index) = lights_of(images);
     if lights.is_empty() {
         return Err(MediumError::Unusable { detail: "a fit needs at least one photograph".into() });
     }
     let transport = surfel_transport(surface, offered_widths(surface, options))?;
     let entering = irradiance(surface, surface.positions(), &normals_of(surface), &lights, options.falloff)?;
-    let columns = transport.receivers(surface.positions())?.basis(&entering)?;
+    let basis = transport.receivers(surface.positions())?.basis(&entering)?;
+    let places = surface.positions().len() * lights.len();
+    let values: Vec<f32> = (0..places).flat_map(|p| basis.iter().map(move |b| b[p])).collect();
+    drop(basis);
+    let diffuse = vec![1.0 / std::f32::consts::PI; options.widths];
+    let columns = Columns { count: options.widths, values: &values, exit: &|_| diffuse.clone() };
     let evidence = Evidence::new(surface, images, &columns, &index, lights.len(), options)?;
     let (x, equations) = evidence.solve(options.ridge);
     let s = evidence.shared;
+    let coats = x[3 * s..].iter().map(|v| *v as f32).collect();
     let weights = (0..s - 1).map(|k| std::array::from_fn(|c| x[c * s + k] as f32)).collect();
     let local = std::array::from_fn(|c| x[c * s + s - 1] as f32);
     let described = describe(transport.widths(), &equations, &x, s)?;
-    Ok(Medium {
+    let medium = Medium {
         unit: evidence.unit,
         transport: Transport::Profile { widths: transport.widths().to_vec(), weights, local },
         coat: evidence.coat(&x),
         quality: Some(evidence.quality(&x)),
         described: Some(described),
-    })
+    };
+    Ok((medium, coats))
 }
 
 /// Steps of the search along each of reflectance and mean free path, and its rounds.

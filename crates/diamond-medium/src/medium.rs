@@ -106,6 +106,13 @@ pub struct Described {
     pub mean_free_path: [f32; 3],
 }
 
+/// A fit whose difference exceeds this part of the photographs' values is none.
+const BAD_FIT: f32 = 0.3;
+/// More of the difference than this under all lights alike is texture.
+const TEXTURED: f32 = 0.5;
+/// Media below this reflectance return hardly any light.
+const DARK: f32 = 0.02;
+
 fn check(what: &'static str, values: &[f32], expected: &'static str, accept: impl Fn(f32) -> bool) -> Result<(), MediumError> {
     match values.iter().find(|v| !(v.is_finite() && accept(**v))) {
         None => Ok(()),
@@ -152,6 +159,44 @@ impl Medium {
                 check("gain of a medium", gain, "numbers > 0", |v| v > 0.0)
             }
         }
+    }
+
+    /// `profile` or `walks`.
+    pub fn kind(&self) -> &'static str {
+        match self.transport {
+            Transport::Profile { .. } => "profile",
+            Transport::Walk { .. } => "walks",
+        }
+    }
+
+    /// What a user should know of a fit: where a homogeneous medium is not what the photographs show. `spacing` is the width of a surfel.
+    pub fn remarks(&self, spacing: f32) -> Vec<String> {
+        let mut out = Vec::new();
+        if let Some(q) = &self.quality {
+            if q.relative_error > BAD_FIT {
+                out.push(format!(
+                    "medium: explains the photographs badly (difference {:.0} % of their values, {:.1} dB): the object may be clear like glass, of \
+                     several materials, or its shape is not known well enough; the residual has to carry it",
+                    100.0 * q.relative_error, q.psnr
+                ));
+            }
+            if q.constant_part > TEXTURED && q.relative_error > 0.5 * BAD_FIT {
+                out.push(format!(
+                    "medium: {:.0} % of the difference is the same under all lights of a view: texture or several materials, which tints take up",
+                    100.0 * q.constant_part
+                ));
+            }
+        }
+        let (reflectance, radius) = (self.reflectance(), self.mean_radius());
+        if reflectance.max_element() < DARK {
+            out.push(format!(
+                "medium: hardly any light comes out of it (reflectance {:.3}): clear, black or metal",
+                reflectance.max_element()
+            ));
+        } else if radius.max_element() < 1.5 * spacing {
+            out.push("medium: opaque; light leaves where it enters, as far as surfels can tell: `mlp` is enough".into());
+        }
+        out
     }
 
     /// The profile without its local part; errors for media that have none.

@@ -35,6 +35,26 @@ pub struct Attachment {
 }
 
 impl Attachment {
+    /// Surfels of a place.
+    pub const NEIGHBOURS: usize = NEIGHBOURS;
+
+    /// Surfels and weights, places × [`Attachment::NEIGHBOURS`] each, for a file of numbers.
+    pub fn to_columns(&self) -> (Vec<f32>, Vec<f32>) {
+        // Surfels are far below 2²⁴, so f32 holds their numbers exactly.
+        (self.surfels.iter().flatten().map(|j| *j as f32).collect(), self.weights.iter().flatten().copied().collect())
+    }
+
+    /// What [`Attachment::to_columns`] gave; `None` where a surfel is not one of so many, or the lists do not fit.
+    pub fn from_columns(surfels: &[f32], weights: &[f32], count: usize) -> Option<Self> {
+        let valid = surfels.iter().all(|j| *j >= 0.0 && (*j as usize) < count) && surfels.len() == weights.len();
+        let (of, rest) = surfels.as_chunks::<NEIGHBOURS>();
+        valid.then_some(())?;
+        rest.is_empty().then(|| Self {
+            surfels: of.iter().map(|row| row.map(|j| j as u32)).collect(),
+            weights: weights.as_chunks::<NEIGHBOURS>().0.to_vec(),
+        })
+    }
+
     /// Number of places.
     pub fn len(&self) -> usize {
         self.surfels.len()

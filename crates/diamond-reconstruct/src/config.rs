@@ -510,6 +510,9 @@ pub struct Subsurface {
     pub from: f32,
     /// Fractions of the run after which they are fitted again, ascending.
     pub refit: Vec<f32>,
+    /// A mesh (PLY or OBJ, in the capture's frame) that takes the place of the surface of the model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface: Option<std::path::PathBuf>,
     /// Cells of the surface along the longest side of the object.
     pub resolution: u32,
     /// Standard deviation of a point's weight in the surface, cells.
@@ -530,7 +533,7 @@ pub struct Subsurface {
     pub seed_width: f32,
     /// Factor on the learning rates of materials, tints among them, once there is a medium.
     pub material_rate: f32,
-    /// Pull of what the network adds toward nothing.
+    /// Pull of what the residual adds toward nothing, over the number of training views.
     pub residual_weight: f32,
 }
 
@@ -538,19 +541,20 @@ impl Default for Subsurface {
     fn default() -> Self {
         Self {
             model: SubsurfaceModel::Mlp,
-            from: 0.15,
-            refit: vec![0.4, 0.7],
+            from: 0.0,
+            refit: Vec::new(),
+            surface: None,
             resolution: 80,
             smoothing: 1.0,
             surfels: 6000,
             widths: 12,
             seeds: 6000,
-            shape_rate: 1.0,
-            normal_rate: 1.0,
-            inset: 0.0,
-            seed_width: 0.6,
-            material_rate: 1.0,
-            residual_weight: 0.0,
+            inset: 1.5,
+            seed_width: 0.45,
+            shape_rate: 0.3,
+            normal_rate: 0.1,
+            material_rate: 0.1,
+            residual_weight: 3.0,
         }
     }
 }

@@ -9,7 +9,7 @@ use crate::{
     Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, GaussianParameters, Layout,
     MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
 };
-use crate::{forward, mcmc};
+use crate::{forward, mcmc, residual_pull};
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
 use diamond_splat::GaussiansGrad;
@@ -25,6 +25,8 @@ pub struct CpuEngine {
     pub(crate) stats: DensityStats,
     profile: Profile,
     counters: Counters,
+    /// Training views.
+    views: usize,
 }
 
 /// Steps after which Gaussians look anew for the surfels around them.
@@ -81,7 +83,13 @@ impl CpuEngine {
             stats,
             profile: Profile::default(),
             counters: Counters::default(),
+            views: 1,
         }
+    }
+
+    /// Told how many training views there are: the fewer, the less is left to the residual beside a medium.
+    pub fn with_views(self, views: usize) -> Self {
+        Self { views, ..self }
     }
 
     /// Whether an attribute has a gradient at all; one that has none stays as it is without Adam.
@@ -272,6 +280,12 @@ impl Engine for CpuEngine {
                 self.profile.add("visibility term", t);
             }
         }
+        if self.needs.residual_pull.needed && self.model.medium.is_some() {
+            let mut random = Random::new(self.model.config.seed, Purpose::ResidualPull, step);
+            let value =
+                residual_pull::pull_to_nothing(&self.model, &activated, self.views, &mut random, &mut total, &mut network_grad)?;
+            terms.add(&[value], 1.0);
+        }
         if self.needs.transfer_smoothness.needed {
             objective::regularise(&self.model, &mut total, &mut terms);
         }
@@ -348,6 +362,9 @@ impl Engine for CpuEngine {
         if !exposure.names.is_empty() {
             file.insert("exposure.log_gain", &[exposure.names.len(), 3], exposure.log_gains.clone());
         }
+        if let Some(medium) = &self.model.medium {
+            medium.store(&mut file)?;
+        }
         // Counts are far below 2²⁴, so f32 holds them exactly.
         let views = self.stats.views.iter().map(|&v| v as f32).collect();
         file.insert("density.gradient_sum", &[n], self.stats.gradient_sum.clone());
@@ -387,6 +404,9 @@ impl Engine for CpuEngine {
             max_radius: state.take(path, "density.max_radius", n)?,
         };
         self.visibility = VisibilityCache::restore(path, &mut state, n)?;
+        let falloff = self.model.scene.falloff(&self.model.config);
+        self.model.medium =
+            MediumTerm::restore(path, &mut state, n, self.model.config.subsurface.surfels, falloff)?;
         self.model.parameters = parameters;
         Ok(())
     }

@@ -40,6 +40,7 @@ pub mod random;
 mod reconstruction;
 mod region;
 mod render;
+mod residual_pull;
 mod rows;
 mod scene;
 mod schedule;

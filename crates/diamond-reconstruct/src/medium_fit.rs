@@ -7,11 +7,13 @@ use crate::{Config, InitialSource, Model, ReconstructError, Renderer, error};
 use diamond_dataset::{Capture, Observation, Shot, View};
 use diamond_image::Image;
 use diamond_medium::{
-    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, hull_bounds,
+    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, fit_walk, hull_bounds,
 };
+use diamond_pathtrace::RepairOptions;
 use diamond_shading::pseudo_normals;
 use diamond_splat::mean_squared_distance_to_nearest;
 use glam::{Vec2, Vec3};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Views from which the surface is looked at, at most.
@@ -57,6 +59,9 @@ fn cloud(capture: &Capture, config: &Config) -> Result<(Vec<OrientedPoint>, f32)
 
 /// The surface of a model, as the training views show it.
 pub fn surface_of(model: &Model, capture: &Capture) -> Result<Surface, ReconstructError> {
+    if let Some(path) = &model.config.subsurface.surface {
+        return given(path, model.config.subsurface.surfels);
+    }
     let renderer = Renderer::new(model);
     let views: Vec<&View> = spread(&capture.train, SHAPE_VIEWS).collect();
     let (mut points, spacing) = cloud(capture, &model.config)?;
@@ -121,6 +126,17 @@ pub fn surface_of(model: &Model, capture: &Capture) -> Result<Surface, Reconstru
     carve(&points, &silhouettes, bounds, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
 }
 
+/// The surface of a mesh file.
+fn given(path: &Path, surfels: usize) -> Result<Surface, ReconstructError> {
+    let fail = |detail: String| ReconstructError::Unusable { detail: format!("subsurface.surface: {detail}") };
+    let mesh = match path.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj")) {
+        true => diamond_pathtrace::read_obj(path),
+        false => diamond_pathtrace::read_ply(path),
+    };
+    let repaired = mesh.and_then(|m| m.repair(&RepairOptions::default())).map_err(|e| fail(e.to_string()))?;
+    Surface::new(repaired.0, surfels).map_err(|e| fail(e.to_string()))
+}
+
 /// Fits a medium within `surface` to the training photographs.
 pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
     let shots: Vec<(&View, &Shot)> =
@@ -151,7 +167,8 @@ pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<
         unit: model.scene.light_scale,
         ..FitOptions::default()
     };
-    fit_profile(surface, &images, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+    let fit = if model.config.subsurface.model.walks() { fit_walk } else { fit_profile };
+    fit(surface, &images, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
 }
 
 /// Tints as the views show them; neighbouring photographs of one view share theirs.

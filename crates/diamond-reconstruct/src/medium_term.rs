@@ -9,12 +9,14 @@
 //! to what leaves the medium rather than mixed with it.
 use crate::rows::{LightRows, Rows};
 use crate::visibility_cache::{LightKey, key};
-use crate::{Activated, Attribute, Model, ReconstructError, error, logit};
+use crate::{Activated, Attribute, Model, ReconstructError, TensorFile, error, logit};
 use diamond_light::{Falloff, OlatLight};
 use diamond_medium::{Attachment, Exitance, Medium, Near, Surface};
+use diamond_pathtrace::Mesh;
 use diamond_shading::{Entry, SurfelLighting};
 use glam::{Quat, Vec3};
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 /// Logit of the subsurfaceness that Gaussians have when a medium comes in: nearly 1, and still able to fall to nil.
@@ -98,6 +100,22 @@ impl MediumTerm {
         &self.medium
     }
 
+    /// What was fitted, for people: a line each.
+    pub fn describe(&self) -> Vec<String> {
+        let mesh = self.surface.mesh();
+        let (r, l) = (self.medium.reflectance(), self.medium.mean_radius());
+        let mut lines = vec![format!(
+            "medium: {} inside a surface of {} triangles, {} surfels; reflectance {:.2} {:.2} {:.2}, light spreads over {:.3} {:.3} {:.3} of the object's radius",
+            self.medium.kind(),
+            mesh.triangles.len(),
+            self.surface.patches().len(),
+            r.x, r.y, r.z,
+            l.x / self.surface.radius(), l.y / self.surface.radius(), l.z / self.surface.radius()
+        )];
+        lines.extend(self.medium.remarks(self.surface.spacing()));
+        lines
+    }
+
     /// The same surface and Gaussians with another medium.
     pub fn with_medium(&self, medium: Medium) -> Result<Self, ReconstructError> {
         let exitance = Exitance::new(&self.surface, &medium).map_err(error::stage("medium"))?;
@@ -109,14 +127,54 @@ impl MediumTerm {
         self.attachment = self.surface.attach(&activated.gaussians.means, &activated.normals);
     }
 
-    /// The surfels around each Gaussian.
-    pub(crate) fn attachment(&self) -> &Attachment {
-        &self.attachment
+    /// Writes surface, medium and surfels of the Gaussians into a checkpoint.
+    pub(crate) fn store(&self, file: &mut TensorFile) -> Result<(), ReconstructError> {
+        let mesh = self.surface.mesh();
+        let flat = |v: &[Vec3]| v.iter().flat_map(|p| p.to_array()).collect::<Vec<f32>>();
+        file.insert("medium.positions", &[mesh.positions.len(), 3], flat(&mesh.positions));
+        file.insert("medium.normals", &[mesh.positions.len(), 3], flat(mesh.normals.as_deref().unwrap_or_default()));
+        // Far below 2²⁴, so f32 holds them exactly.
+        let triangles = mesh.triangles.iter().flatten().map(|i| *i as f32).collect();
+        file.insert("medium.triangles", &[mesh.triangles.len(), 3], triangles);
+        let (surfels, weights) = self.attachment.to_columns();
+        let shape = [self.attachment.len(), surfels.len() / self.attachment.len().max(1)];
+        file.insert("medium.surfels", &shape, surfels);
+        file.insert("medium.weights", &shape, weights);
+        file.metadata.insert("medium".into(), self.medium.to_toml().map_err(error::stage("medium"))?);
+        file.metadata.insert("medium_vertices".into(), mesh.positions.len().to_string());
+        file.metadata.insert("medium_triangles".into(), mesh.triangles.len().to_string());
+        Ok(())
     }
 
-    /// Puts back surfels that were found before.
-    pub(crate) fn set_attachment(&mut self, attachment: Attachment) {
-        self.attachment = attachment;
+    /// What [`MediumTerm::store`] wrote for `gaussians` Gaussians, if it did.
+    pub(crate) fn restore(
+        path: &Path,
+        state: &mut TensorFile,
+        gaussians: usize,
+        surfels: usize,
+        falloff: Falloff,
+    ) -> Result<Option<Self>, ReconstructError> {
+        let Some(text) = state.metadata.get("medium").cloned() else { return Ok(None) };
+        let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
+        let medium = Medium::parse(&text).map_err(|e| fail(e.to_string()))?;
+        let (vertices, triangles): (usize, usize) =
+            (state.metadata_value(path, "medium_vertices")?, state.metadata_value(path, "medium_triangles")?);
+        let mut vectors = |name: &str| -> Result<Vec<Vec3>, ReconstructError> {
+            Ok(state.take(path, name, 3 * vertices)?.chunks_exact(3).map(Vec3::from_slice).collect())
+        };
+        let (positions, normals) = (vectors("medium.positions")?, vectors("medium.normals")?);
+        let indices = state.take(path, "medium.triangles", 3 * triangles)?;
+        let triangles = indices.chunks_exact(3).map(|t| [t[0] as u32, t[1] as u32, t[2] as u32]).collect();
+        let mesh = Mesh { positions, normals: Some(normals), triangles, ..Mesh::default() };
+        let surface = Surface::new(mesh, surfels).map_err(|e| fail(e.to_string()))?;
+        let width = gaussians * Attachment::NEIGHBOURS;
+        let (around, weights) =
+            (state.take(path, "medium.surfels", width)?, state.take(path, "medium.weights", width)?);
+        let attachment = Attachment::from_columns(&around, &weights, surface.positions().len())
+            .ok_or_else(|| fail("`medium.surfels` names surfels that the surface does not have".into()))?;
+        let mut term = Self::new(surface, medium, falloff, &[], &[])?;
+        term.attachment = attachment;
+        Ok(Some(term))
     }
 
     fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Leaving>> {
@@ -159,6 +217,11 @@ impl MediumTerm {
         visible.iter().map(|&i| activated.base_color[i as usize] * TINT).collect()
     }
 
+    /// Factor on what surfels send out of a Gaussian with a normal, toward the viewer.
+    pub(crate) fn toward(&self, normal: Vec3, view_direction: Vec3) -> Vec3 {
+        self.exitance.toward(normal.dot(view_direction))
+    }
+
     fn local(&self) -> Vec3 {
         self.medium.local() / whole()
     }
@@ -192,7 +255,8 @@ impl MediumTerm {
         };
         let untinted = rows.visible.iter().enumerate().map(|(row, &i)| {
             let around = self.attachment.rgb(i as usize, leaving) * self.over_falloff(&lamp[0], rows.positions[row]);
-            around * scale + own.get(3 * row).map_or(Vec3::ZERO, |e| local * *e)
+            let toward = self.exitance.toward(rows.normals[row].dot(rows.view_directions[row]));
+            around * toward * scale + own.get(3 * row).map_or(Vec3::ZERO, |e| local * *e)
         });
         Ok(MediumRows { untinted: untinted.collect(), tints })
     }
@@ -213,8 +277,9 @@ impl MediumTerm {
         lamp: &OlatLight,
         leaving: &[f32],
         visibility: f32,
+        toward: Vec3,
     ) -> Vec3 {
-        let around = self.attachment.rgb(gaussian, leaving) * self.over_falloff(lamp, position);
+        let around = self.attachment.rgb(gaussian, leaving) * toward * self.over_falloff(lamp, position);
         let cos_theta_i = normal.dot(lamp.incidence(position, Falloff::None).direction).max(0.0);
         tint * (around * (1.0 / whole()) + self.local() * (visibility * cos_theta_i))
     }

@@ -145,6 +145,8 @@ needs! {
     input_gradient: Model, "a product with the first layer";
     /// A homogeneous medium inside the object.
     medium: Model, "a surface and a fit, some three times a run, and a look-up for every visible Gaussian";
+    /// The residual's pull toward nothing.
+    residual_pull: Term, "the network, forward and backward, for some Gaussians";
     /// Latent codes.
     codes: Model, "inputs of the network and their part of Adam";
     /// Transfer vectors.
@@ -278,6 +280,9 @@ impl Needs {
                 true => Decision::new(true, "subsurface.model names one"),
                 false => Decision::new(false, "subsurface.model = \"mlp\": the network alone"),
             },
+            residual_pull: Decision::weight("subsurface.residual_weight", config.subsurface.residual_weight)
+                .only_if(config.subsurface.model.has_medium(), "there is no medium that would explain the light instead")
+                .only_if(residual.network || residual.transfer, "there is no residual"),
             codes: Decision::new(residual.codes > 0, format!("residual.codes = {}", residual.codes))
                 .only_if(residual.network, "only the network reads codes (residual.network = false)"),
             transfer: Decision::new(residual.transfer, format!("residual.transfer = {}", residual.transfer)),

@@ -24,6 +24,8 @@ pub enum Purpose {
     Noise = 7,
     /// Which other view a view is compared with, and at which pixels.
     Consistency = 8,
+    /// Where and how the residual is asked to be nothing.
+    ResidualPull = 9,
 }
 
 /// A seeded stream of random numbers.

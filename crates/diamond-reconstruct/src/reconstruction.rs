@@ -31,6 +31,8 @@ pub struct Reconstruction {
     /// Of each training view the nearest others, where views are compared.
     neighbours: Vec<Vec<usize>>,
     step: u64,
+    /// What is to be told since it was last asked.
+    notes: Vec<String>,
     /// Where the first Gaussians came from, for the log.
     pub initial_origin: String,
 }
@@ -89,7 +91,7 @@ impl Reconstruction {
         Ok(Self {
             capture,
             config: config.clone(),
-            engine: Box::new(CpuEngine::with_needs(model, needs.clone())),
+            engine: Box::new(CpuEngine::with_needs(model, needs.clone()).with_views(facts.views)),
             needs,
             facts,
             contents: vec![None; pairs.len()],
@@ -97,6 +99,7 @@ impl Reconstruction {
             order,
             neighbours,
             step: 0,
+            notes: Vec::new(),
             initial_origin: points.origin.clone(),
         })
     }
@@ -179,6 +182,11 @@ impl Reconstruction {
         self.step > 0 && self.step.is_multiple_of(self.config.checkpoint_steps)
     }
 
+    /// What has happened since this was last asked that a user wants to know: which medium was fitted and how well.
+    pub fn take_notes(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notes)
+    }
+
     /// The configuration.
     pub fn config(&self) -> &Config {
         &self.config
@@ -229,8 +237,17 @@ impl Reconstruction {
         let plan = StepPlan::new(&self.config, self.step);
         if plan.fit_medium {
             let model = self.engine.model()?;
-            let medium = crate::fit_medium(model, &self.capture)?;
-            self.engine.adopt_medium(medium)?;
+            match crate::fit_medium(model, &self.capture) {
+                Ok(medium) => {
+                    self.notes.extend(medium.describe());
+                    self.engine.adopt_medium(medium)?;
+                }
+                // Without a surface or a fit the run goes on as it is.
+                Err(ReconstructError::Unusable { detail }) => {
+                    self.notes.push(format!("no medium was fitted at step {}: {detail}", self.step));
+                }
+                Err(other) => return Err(other),
+            }
         }
         let batch = self.config.accumulate as u64;
         let mut loaded: Vec<Loaded> = Vec::with_capacity(batch as usize);

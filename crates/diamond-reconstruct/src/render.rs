@@ -538,10 +538,11 @@ impl ViewHalf {
                 to.copy_from_slice(values);
                 let (Some(medium), Some(place)) = (medium, self.channels.places.residual) else { return };
                 let (position, normal) = (self.rows.positions[row], self.rows.normals[row]);
+                let toward = medium.toward(normal, self.rows.view_directions[row]);
                 let lit = lights.iter().zip(&lamps).zip(&leaving);
                 for (to, ((light, lamp), leaving)) in to.chunks_exact_mut(self.channels.per_light).zip(lit) {
                     let (i, visibility) = (self.rows.visible[row] as usize, light.1.get(row).copied().unwrap_or(0.0));
-                    let rgb = medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility);
+                    let rgb = medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility, toward);
                     to[place..place + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
                 }
             };

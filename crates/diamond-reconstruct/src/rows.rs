@@ -36,12 +36,23 @@ impl Rows {
     /// Of the Gaussians `visible` from `camera`.
     pub fn new(model: &Model, activated: &Activated, camera: &Camera, visible: &[u32]) -> Self {
         let eye = camera.pose.centre();
+        let toward = |i: &u32| (eye - activated.gaussians.means[*i as usize]).try_normalize().unwrap_or(Vec3::Z);
+        Self::with_view_directions(model, activated, visible.iter().map(toward).collect(), visible)
+    }
+
+    /// Of the Gaussians `visible`, each seen from a direction of its own.
+    pub fn with_view_directions(
+        model: &Model,
+        activated: &Activated,
+        view_directions: Vec<Vec3>,
+        visible: &[u32],
+    ) -> Self {
         let pick = |v: &[Vec3]| visible.iter().map(|&i| v[i as usize]).collect::<Vec<Vec3>>();
         let g = &activated.gaussians;
         let positions = pick(&g.means);
         let residual = &model.config.residual;
         Self {
-            view_directions: positions.iter().map(|p| (eye - *p).try_normalize().unwrap_or(Vec3::Z)).collect(),
+            view_directions,
             rotations: visible.iter().map(|&i| unit(g.rotations[i as usize])).collect(),
             scales: pick(&g.scales),
             normals: pick(&activated.normals),

@@ -150,8 +150,10 @@ struct Costs {
 const COSTS_FILE: &str = "costs.json";
 
 /// Files and folders that a run writes; `--force` removes these and nothing else.
-const RESULTS: [&str; 16] = [
+const RESULTS: [&str; 18] = [
     "model.ply",
+    "medium.toml",
+    "surface.ply",
     "config.toml",
     "scene.toml",
     "exposure.toml",
@@ -329,6 +331,7 @@ fn run(
             }
             Err(e) => return Err(e.into()),
         };
+        training.take_notes().into_iter().for_each(|note| events(Event::Note(note)));
         log.push(&report);
         events(Event::Step { report: &report, psnr: log.running_psnr().unwrap_or(0.0) });
         let stop = interrupted.load(Ordering::SeqCst);

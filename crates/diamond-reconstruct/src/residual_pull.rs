@@ -1,0 +1,97 @@
+//! The residual's pull toward nothing, where a medium explains the light.
+//!
+//! What a few photographs leave open, network and transfer vectors fill with anything: for places that no view shows, for lights that
+//! were not lit. So at every step some Gaussians are taken at random, each with a random light and a random direction from which it may be seen, and what the
+//! residual adds there is asked to be 0: [eq:residual-pull] Σ r² / 3N. Photographs win where they speak, and nothing wins where they do not.
+use crate::objective::TermValue;
+use crate::random::Random;
+use crate::rows::{LightRows, Rows, input_scaling, residual_inputs, transfer_config};
+use crate::{Activated, ActivatedGrad, Attribute, Model, ReconstructError, error};
+use diamond_shading::{InputGradients, transfer_radiance};
+use glam::Vec3;
+
+/// Gaussians that are looked at in a step.
+const SAMPLES: usize = 1024;
+
+/// Value of the term; adds its gradient, times its weight, to codes, transfer vectors and network.
+pub(crate) fn pull_to_nothing(
+    model: &Model,
+    activated: &Activated,
+    views: usize,
+    random: &mut Random,
+    total: &mut ActivatedGrad,
+    network_grad: &mut Vec<Vec<f32>>,
+) -> Result<TermValue, ReconstructError> {
+    let (n, weight) = (model.len(), model.config.subsurface.residual_weight / views.max(1) as f32);
+    let samples = SAMPLES.min(n);
+    // In order and each once, as rows are.
+    let mut visible: Vec<u32> = (0..samples).map(|_| random.below(n) as u32).collect();
+    visible.sort_unstable();
+    visible.dedup();
+    let mut outward = |normal: Vec3| {
+        let d = random.direction();
+        if d.dot(normal) < 0.0 { -d } else { d }
+    };
+    let view_directions: Vec<Vec3> = visible.iter().map(|&i| outward(activated.normals[i as usize])).collect();
+    let rows = Rows::with_view_directions(model, activated, view_directions, &visible);
+    let directions: Vec<Vec3> = (0..rows.len()).map(|_| random.direction()).collect();
+    let visibility: Vec<f32> = directions
+        .iter()
+        .zip(&rows.normals)
+        .map(|(l, normal)| if l.dot(*normal) > 0.0 { random.uniform() } else { 0.0 })
+        .collect();
+    let lit = LightRows { visibility, directions, distances: vec![model.scene.light_distance; rows.len()] };
+    let mut sum = vec![0.0f32; 3 * rows.len()];
+    let inputs = residual_inputs(model, &rows, &lit);
+    let scaling = input_scaling(model);
+    let assembled = match &model.network {
+        Some(network) => {
+            let (matrix, pullback) = inputs.assemble(&scaling).map_err(error::stage("residual inputs"))?;
+            let (out, _) = network.forward(&matrix, rows.len()).map_err(error::stage("residual network"))?;
+            sum.iter_mut().zip(&out.residual).for_each(|(s, r)| *s += r);
+            Some((network, matrix, pullback))
+        }
+        None => None,
+    };
+    let transfer = match transfer_config(model) {
+        Some(config) => {
+            let of = transfer_radiance(&rows.transfer, &lit.directions, config);
+            let (radiance, pullback) = of.map_err(error::stage("transfer vectors"))?;
+            sum.iter_mut().zip(&radiance).for_each(|(s, r)| *s += r);
+            Some(pullback)
+        }
+        None => None,
+    };
+    let scale = 1.0 / sum.len().max(1) as f32;
+    let value = scale * sum.iter().map(|r| r * r).sum::<f32>();
+    let d: Vec<f32> = sum.iter().map(|r| 2.0 * weight * scale * r).collect();
+    if let Some((network, matrix, pullback)) = &assembled {
+        let pulled = network.pullback(matrix, rows.len()).and_then(|p| p.pull(&d, &[], model.config.residual.codes > 0));
+        let mut grad = pulled.map_err(error::stage("residual network.pull"))?;
+        if let Some(d_inputs) = grad.inputs.take() {
+            let codes = model.config.residual.codes;
+            let d = pullback.pull(&d_inputs, InputGradients::Learned).map_err(error::stage("residual inputs.pull"))?;
+            total.codes.resize(n * codes, 0.0);
+            for (row, &i) in rows.visible.iter().enumerate() {
+                let to = &mut total.codes[i as usize * codes..(i as usize + 1) * codes];
+                to.iter_mut().zip(&d.codes[row * codes..]).for_each(|(a, b)| *a += b);
+            }
+        }
+        let parts = [&grad.trunk, &grad.residual_head];
+        network_grad.resize(network_grad.len().max(2), Vec::new());
+        for (to, from) in network_grad.iter_mut().zip(parts) {
+            to.resize(from.len(), 0.0);
+            to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
+        }
+    }
+    if let Some(pullback) = &transfer {
+        let grad = pullback.pull(&d, false).map_err(error::stage("transfer vectors.pull"))?;
+        let width = model.config.residual.transfer_width();
+        total.transfer.resize(model.parameters.values(Attribute::Transfer).len(), 0.0);
+        for (row, &i) in rows.visible.iter().enumerate() {
+            let to = &mut total.transfer[i as usize * width..(i as usize + 1) * width];
+            to.iter_mut().zip(&grad.transfer[row * width..]).for_each(|(a, b)| *a += b);
+        }
+    }
+    Ok(TermValue { name: "residual_pull", weight, value })
+}
