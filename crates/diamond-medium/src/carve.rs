@@ -231,7 +231,9 @@ pub fn carve(
         });
     }
     if points.is_empty() && silhouettes.is_empty() {
-        return Err(MediumError::Unusable { detail: "a surface needs points or silhouettes; give some of either".into() });
+        return Err(MediumError::Unusable {
+            detail: "a surface needs points or silhouettes; give some of either".into(),
+        });
     }
     let cell = side / options.resolution as f32;
     // Two nodes all around are outside.
@@ -258,7 +260,13 @@ pub fn carve(
         grid.values = (0..total)
             .into_par_iter()
             .with_min_len(1024)
-            .map(|i| if hull[i] >= FAR * cell { FAR * cell } else { plane_distance(points, &near, width, grid.at(grid.node(i))) })
+            .map(|i| {
+                if hull[i] >= FAR * cell {
+                    FAR * cell
+                } else {
+                    plane_distance(points, &near, width, grid.at(grid.node(i)))
+                }
+            })
             .collect();
         let by_points: Vec<bool> = grid.values.iter().zip(&hull).map(|(v, h)| !v.is_nan() && *h < FAR * cell).collect();
         spread_signs(&mut grid, &by_points);
@@ -386,10 +394,8 @@ mod tests {
     }
 
     fn view(from: Vec3) -> Silhouette {
-        let camera = Camera {
-            intrinsics: Intrinsics::from_fov_x(0.7, 64, 64),
-            pose: Pose::look_at(from, Vec3::ZERO, Vec3::Z),
-        };
+        let camera =
+            Camera { intrinsics: Intrinsics::from_fov_x(0.7, 64, 64), pose: Pose::look_at(from, Vec3::ZERO, Vec3::Z) };
         let mut coverage = vec![0.0; 64 * 64];
         for (i, c) in coverage.iter_mut().enumerate() {
             let ray = camera.ray(Vec2::new((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5));
@@ -418,7 +424,8 @@ mod tests {
         let options = CarveOptions { resolution: 40, ..Default::default() };
         let points = sphere(4000, |n| n.x > 0.0);
         let box_ = (Vec3::NEG_ONE, Vec3::ONE);
-        let eyes = [Vec3::new(0.0, 4.0, 0.3), Vec3::new(0.0, 0.4, 4.0), Vec3::new(0.3, 2.8, 2.8), Vec3::new(0.2, -2.8, 2.8)];
+        let eyes =
+            [Vec3::new(0.0, 4.0, 0.3), Vec3::new(0.0, 0.4, 4.0), Vec3::new(0.3, 2.8, 2.8), Vec3::new(0.2, -2.8, 2.8)];
         let views: Vec<Silhouette> = eyes.iter().map(|e| view(*e)).collect();
         let surface = carve(&points, &views, box_, &options).unwrap();
         let (least, most) = radii(&surface);

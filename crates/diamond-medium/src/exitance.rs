@@ -71,7 +71,8 @@ impl Exitance {
             Form::Profile { profile, transport } => {
                 let coloured: Vec<f32> = entering.iter().flat_map(|e| [*e; 3]).collect();
                 let (out, _) = transport.receivers(surface.positions())?.exitance(profile, &coloured)?;
-                let of = |l: usize| (0..surfels).flat_map(|j| out[(j * n + l) * 3..][..3].iter().map(|v| v / PI)).collect();
+                let of =
+                    |l: usize| (0..surfels).flat_map(|j| out[(j * n + l) * 3..][..3].iter().map(|v| v / PI)).collect();
                 Ok((0..n).map(of).collect())
             }
             Form::Walk { operators, gain } => {
@@ -88,6 +89,45 @@ impl Exitance {
         }
     }
 
+    /// How far light goes: of what leaves anywhere, the part per ring of distance between entry and exit, for rings whose radius grows by a constant factor
+    /// from half a surfel's width to the diameter of the object; (outer radius in scene units, linear RGB that add up to the reflectance of the object
+    /// under light from all sides). Distances below a surfel's width are together.
+    pub fn spread(&self, surface: &Surface) -> Vec<(f32, Vec3)> {
+        let (least, most) = (0.5 * surface.spacing(), 2.0 * surface.radius());
+        let ratio = libm::logf(most / least);
+        let ring = |d: f32| ((libm::logf(d.max(least) / least) / ratio * RINGS as f32) as usize).min(RINGS - 1);
+        let mut rings: Vec<(f32, Vec3)> =
+            (0..RINGS).map(|k| (least * libm::expf(ratio * (k + 1) as f32 / RINGS as f32), Vec3::ZERO)).collect();
+        match &self.form {
+            Form::Profile { profile, .. } => {
+                // Within a circle a Gaussian has 1 − exp(−r²/2σ²).
+                let within = |r: f32| -> Vec3 {
+                    let each = profile.widths().iter().zip(&profile.weights);
+                    each.map(|(s, w)| *w * (1.0 - libm::expf(-0.5 * (r / s) * (r / s)))).sum()
+                };
+                let mut before = Vec3::ZERO;
+                for (radius, share) in &mut rings {
+                    let now = within(*radius);
+                    *share = now - before;
+                    before = now;
+                }
+            }
+            Form::Walk { operators, gain } => {
+                let patches = surface.patches();
+                let area: f32 = patches.iter().map(|p| p.area).sum();
+                for (c, operator) in operators.iter().enumerate() {
+                    for (i, patch) in patches.iter().enumerate() {
+                        for k in operator.offsets[i] as usize..operator.offsets[i + 1] as usize {
+                            let apart = patch.position.distance(patches[operator.sources[k] as usize].position);
+                            rings[ring(apart)].1[c] += gain[c] * operator.weights[k] * patch.area / area;
+                        }
+                    }
+                }
+            }
+        }
+        rings
+    }
+
     /// Factor on the radiance of a surfel toward the outer cosine `mu`, 0 … 1: linear RGB; 1 for profiles.
     #[inline]
     pub fn toward(&self, mu: f32) -> Vec3 {
@@ -101,6 +141,9 @@ impl Exitance {
         }
     }
 }
+
+/// Rings of [`Exitance::spread`].
+const RINGS: usize = 40;
 
 /// Least outer cosine at which exits are looked up.
 const MIN_COS_THETA_O: f32 = 0.1;

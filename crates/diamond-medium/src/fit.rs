@@ -116,17 +116,14 @@ pub(crate) fn irradiance(
     falloff: Falloff,
 ) -> Result<Vec<f32>, MediumError> {
     let visibility = surface.visibility(positions, normals, lights);
-    let lighting =
-        SurfelLighting { positions, normals, visibility: &visibility, lights, falloff, entry: Entry::Full };
+    let lighting = SurfelLighting { positions, normals, visibility: &visibility, lights, falloff, entry: Entry::Full };
     Ok(lighting.irradiance()?.into_iter().step_by(3).collect())
 }
 
 /// Transport between the surfels of a surface.
 pub(crate) fn surfel_transport(surface: &Surface, widths: Vec<f32>) -> Result<SurfelTransport, MediumError> {
-    let surfels = Surfels {
-        positions: surface.positions().to_vec(),
-        areas: surface.patches().iter().map(|p| p.area).collect(),
-    };
+    let surfels =
+        Surfels { positions: surface.positions().to_vec(), areas: surface.patches().iter().map(|p| p.area).collect() };
     Ok(SurfelTransport::new(surfels, widths, Balance::Plain)?)
 }
 
@@ -192,7 +189,8 @@ impl<'a> Evidence<'a> {
         lights: usize,
         options: &FitOptions,
     ) -> Result<Self, MediumError> {
-        let total: usize = images.iter().map(|i| (i.camera.intrinsics.width * i.camera.intrinsics.height) as usize).sum();
+        let total: usize =
+            images.iter().map(|i| (i.camera.intrinsics.width * i.camera.intrinsics.height) as usize).sum();
         let covered: f64 = images
             .iter()
             .map(|i| i.mask.map_or(0.3, |m| f64::from(m.area() / (m.width() * m.height()).max(1) as f32)))

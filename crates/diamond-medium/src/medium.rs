@@ -113,7 +113,12 @@ const TEXTURED: f32 = 0.5;
 /// Media below this reflectance return hardly any light.
 const DARK: f32 = 0.02;
 
-fn check(what: &'static str, values: &[f32], expected: &'static str, accept: impl Fn(f32) -> bool) -> Result<(), MediumError> {
+fn check(
+    what: &'static str,
+    values: &[f32],
+    expected: &'static str,
+    accept: impl Fn(f32) -> bool,
+) -> Result<(), MediumError> {
     match values.iter().find(|v| !(v.is_finite() && accept(**v))) {
         None => Ok(()),
         Some(v) => Err(MediumError::Value { what, expected, found: v.to_string() }),
@@ -194,7 +199,9 @@ impl Medium {
                 reflectance.max_element()
             ));
         } else if radius.max_element() < 1.5 * spacing {
-            out.push("medium: opaque; light leaves where it enters, as far as surfels can tell: `mlp` is enough".into());
+            out.push(
+                "medium: opaque; light leaves where it enters, as far as surfels can tell: `mlp` is enough".into(),
+            );
         }
         out
     }
@@ -271,7 +278,9 @@ impl Medium {
             ("coat", _) => self.coat.scale = set(Vec3::splat(self.coat.scale)).x,
             ("mean_free_path", Transport::Profile { widths, .. }) => {
                 if !factor || value.x != value.y || value.y != value.z {
-                    return Err(fail(format!("`{change}`: a profile's distances are multiplied, all channels alike: `mean_free_path=*2`")));
+                    return Err(fail(format!(
+                        "`{change}`: a profile's distances are multiplied, all channels alike: `mean_free_path=*2`"
+                    )));
                 }
                 widths.iter_mut().for_each(|w| *w *= value.x);
             }
@@ -309,7 +318,13 @@ mod tests {
     fn walk() -> Medium {
         Medium {
             unit: 1.0,
-            transport: Transport::Walk { sigma_t: [10.0, 20.0, 30.0], albedo: [0.9; 3], g: 0.0, ior: 1.3, gain: [1.0; 3] },
+            transport: Transport::Walk {
+                sigma_t: [10.0, 20.0, 30.0],
+                albedo: [0.9; 3],
+                g: 0.0,
+                ior: 1.3,
+                gain: [1.0; 3],
+            },
             coat: Coat { roughness: 0.3, scale: 1.0 },
             quality: None,
             described: None,

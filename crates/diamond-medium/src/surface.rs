@@ -1,6 +1,6 @@
 //! The surface that light goes through: a closed mesh, its surfels, and who lies near which of them.
-use crate::near::Near;
 use crate::MediumError;
+use crate::near::Near;
 use diamond_light::{Falloff, OlatLight};
 use diamond_pathtrace::{Facing, Geometry, Mesh, NO_PRIMITIVE, Patch};
 use glam::Vec3;
@@ -182,7 +182,7 @@ impl Surface {
 
 /// Patches of finely cut meshes put together by cells of a grid and the side that they face, so that about `count` are left.
 fn merged(patches: &[Patch], count: usize) -> Vec<Patch> {
-    if patches.len() <= 2 * count || count == 0 {
+    if 4 * patches.len() <= 5 * count || count == 0 {
         return patches.to_vec();
     }
     let area: f32 = patches.iter().map(|p| p.area).sum();

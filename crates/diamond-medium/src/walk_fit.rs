@@ -4,7 +4,9 @@
 //! found is the reduced σ_t and albedo. For each σ_t of a coarse list, each of two boundaries, and each albedo of a list, the error is a quadratic in a
 //! gain that all channels share (photographs seldom say what a full scale of radiance is); the smallest over all of them is refined once in σ_t. The coat
 //! is that of the profile, which is fitted first.
-use crate::fit::{Columns, Evidence, FitImage, FitOptions, fit_profile_and_coats, irradiance, lights_of, normals_of, slope};
+use crate::fit::{
+    Columns, Evidence, FitImage, FitOptions, fit_profile_and_coats, irradiance, lights_of, normals_of, slope,
+};
 use crate::medium::{Medium, Transport};
 use crate::{MediumError, Surface};
 use diamond_light::{Falloff, OlatLight};
@@ -36,9 +38,10 @@ pub(crate) fn boundary(ior: f32) -> Boundary {
 
 /// Outer cosines of surfels toward lights, 0 where the light is behind: surfels × lights.
 pub(crate) fn cosines(surface: &Surface, lights: &[OlatLight]) -> Vec<f32> {
-    let each = surface.patches().iter().flat_map(|p| {
-        lights.iter().map(|l| p.normal.dot(l.incidence(p.position, Falloff::None).direction).max(0.0))
-    });
+    let each = surface
+        .patches()
+        .iter()
+        .flat_map(|p| lights.iter().map(|l| p.normal.dot(l.incidence(p.position, Falloff::None).direction).max(0.0)));
     each.collect()
 }
 
@@ -139,9 +142,8 @@ fn sums_of(
     let exit = |mu: f32| moments.exit_factors(mu);
     let columns = Columns { count: bins, values: &moments.values, exit: &exit };
     let evidence = Evidence::new(surface, images, &columns, index, lights.len(), options)?;
-    let powers: Vec<Vec<f32>> = (0..ABSORPTIONS)
-        .map(|a| moments.exponents.iter().map(|n| libm::powf(albedo(a), *n)).collect())
-        .collect();
+    let powers: Vec<Vec<f32>> =
+        (0..ABSORPTIONS).map(|a| moments.exponents.iter().map(|n| libm::powf(albedo(a), *n)).collect()).collect();
     let parts: Vec<Vec<[f64; 2]>> = evidence
         .rows
         .par_iter()

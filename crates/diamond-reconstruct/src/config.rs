@@ -902,7 +902,9 @@ impl Config {
             }
             let fits = std::iter::once(&medium.from).chain(&medium.refit);
             if !fits.clone().is_sorted() || !fits.clone().all(|f| (0.0..1.0).contains(f)) {
-                return fail("subsurface.from and subsurface.refit: expected ascending fractions of the run, 0 to 1".into());
+                return fail(
+                    "subsurface.from and subsurface.refit: expected ascending fractions of the run, 0 to 1".into(),
+                );
             }
             if !(8..=512).contains(&medium.resolution) || medium.surfels < 100 || !(2..=32).contains(&medium.widths) {
                 return fail("subsurface: expected resolution 8 to 512, at least 100 surfels, widths 2 to 32".into());

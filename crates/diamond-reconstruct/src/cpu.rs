@@ -282,8 +282,14 @@ impl Engine for CpuEngine {
         }
         if self.needs.residual_pull.needed && self.model.medium.is_some() {
             let mut random = Random::new(self.model.config.seed, Purpose::ResidualPull, step);
-            let value =
-                residual_pull::pull_to_nothing(&self.model, &activated, self.views, &mut random, &mut total, &mut network_grad)?;
+            let value = residual_pull::pull_to_nothing(
+                &self.model,
+                &activated,
+                self.views,
+                &mut random,
+                &mut total,
+                &mut network_grad,
+            )?;
             terms.add(&[value], 1.0);
         }
         if self.needs.transfer_smoothness.needed {
@@ -405,8 +411,7 @@ impl Engine for CpuEngine {
         };
         self.visibility = VisibilityCache::restore(path, &mut state, n)?;
         let falloff = self.model.scene.falloff(&self.model.config);
-        self.model.medium =
-            MediumTerm::restore(path, &mut state, n, self.model.config.subsurface.surfels, falloff)?;
+        self.model.medium = MediumTerm::restore(path, &mut state, n, self.model.config.subsurface.surfels, falloff)?;
         self.model.parameters = parameters;
         Ok(())
     }

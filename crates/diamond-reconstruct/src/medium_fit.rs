@@ -7,7 +7,9 @@ use crate::{Config, InitialSource, Model, ReconstructError, Renderer, error};
 use diamond_dataset::{Capture, Observation, Shot, View};
 use diamond_image::Image;
 use diamond_medium::{
-    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, fit_walk, hull_bounds,
+    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, fit_walk,
+    hull_bounds,
+    outward_normals,
 };
 use diamond_pathtrace::RepairOptions;
 use diamond_shading::pseudo_normals;
@@ -48,9 +50,16 @@ fn cloud(capture: &Capture, config: &Config) -> Result<(Vec<OrientedPoint>, f32)
     if points.splats.is_some() {
         return Ok((Vec::new(), 0.0));
     }
-    let each = points.positions.iter().zip(&points.normals).filter(|(_, n)| n.is_normalized());
-    let out: Vec<OrientedPoint> =
-        each.map(|(p, n)| OrientedPoint { position: *p, normal: *n, weight: 1.0 }).collect();
+    let computed;
+    let normals = match points.normals.iter().any(|n| n.is_normalized()) {
+        true => &points.normals,
+        false => {
+            computed = outward_normals(&points.positions);
+            &computed
+        }
+    };
+    let each = points.positions.iter().zip(normals).filter(|(_, n)| n.is_normalized());
+    let out: Vec<OrientedPoint> = each.map(|(p, n)| OrientedPoint { position: *p, normal: *n, weight: 1.0 }).collect();
     let positions: Vec<Vec3> = out.iter().map(|p| p.position).collect();
     let squares = mean_squared_distance_to_nearest(&positions, 3);
     let spacing = (squares.iter().sum::<f32>() / squares.len().max(1) as f32).sqrt();
@@ -139,8 +148,7 @@ fn given(path: &Path, surfels: usize) -> Result<Surface, ReconstructError> {
 
 /// Fits a medium within `surface` to the training photographs.
 pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
-    let shots: Vec<(&View, &Shot)> =
-        capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
+    let shots: Vec<(&View, &Shot)> = capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
     let chosen: Vec<(&View, &Shot)> = spread(&shots, FIT_IMAGES).copied().collect();
     let observations: Vec<Arc<Observation>> =
         chosen.iter().map(|(_, shot)| capture.observation(shot)).collect::<Result<_, _>>()?;

@@ -95,6 +95,11 @@ impl MediumTerm {
         &self.surface
     }
 
+    /// How far light goes; see [`Exitance::spread`].
+    pub fn spread(&self) -> Vec<(f32, Vec3)> {
+        self.exitance.spread(&self.surface)
+    }
+
     /// The medium.
     pub fn medium(&self) -> &Medium {
         &self.medium
@@ -109,8 +114,12 @@ impl MediumTerm {
             self.medium.kind(),
             mesh.triangles.len(),
             self.surface.patches().len(),
-            r.x, r.y, r.z,
-            l.x / self.surface.radius(), l.y / self.surface.radius(), l.z / self.surface.radius()
+            r.x,
+            r.y,
+            r.z,
+            l.x / self.surface.radius(),
+            l.y / self.surface.radius(),
+            l.z / self.surface.radius()
         )];
         lines.extend(self.medium.remarks(self.surface.spacing()));
         lines

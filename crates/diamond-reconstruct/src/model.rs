@@ -3,8 +3,8 @@ use crate::adam::Moments;
 use crate::random::{Purpose, Random};
 use crate::scene::InitialPoints;
 use crate::{
-    Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout, MediumTerm,
-    MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit, write_atomically,
+    Attribute, Config, Covariance, Exposure, ExposureFile, ExposureMode, GaussianParameters, InitialNormals, Layout,
+    MediumTerm, MetalVariant, ReconstructError, Renderer, Rendering, Scene, TensorFile, error, logit, write_atomically,
 };
 use diamond_camera::Camera;
 use diamond_light::OlatLight;
@@ -167,8 +167,7 @@ impl Model {
         }
         let fail = |path: &Path, detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
         let mesh = diamond_pathtrace::read_ply(&surface).map_err(|e| fail(&surface, e.to_string()))?;
-        let surface =
-            Surface::new(mesh, self.config.subsurface.surfels).map_err(|e| fail(&surface, e.to_string()))?;
+        let surface = Surface::new(mesh, self.config.subsurface.surfels).map_err(|e| fail(&surface, e.to_string()))?;
         let medium = Medium::read(&medium).map_err(|e| fail(&medium, e.to_string()))?;
         let activated = self.parameters.activate();
         let falloff = self.scene.falloff(&self.config);

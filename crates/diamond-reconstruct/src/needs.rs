@@ -281,7 +281,10 @@ impl Needs {
                 false => Decision::new(false, "subsurface.model = \"mlp\": the network alone"),
             },
             residual_pull: Decision::weight("subsurface.residual_weight", config.subsurface.residual_weight)
-                .only_if(config.subsurface.model.has_medium(), "there is no medium that would explain the light instead")
+                .only_if(
+                    config.subsurface.model.has_medium(),
+                    "there is no medium that would explain the light instead",
+                )
                 .only_if(residual.network || residual.transfer, "there is no residual"),
             codes: Decision::new(residual.codes > 0, format!("residual.codes = {}", residual.codes))
                 .only_if(residual.network, "only the network reads codes (residual.network = false)"),
@@ -402,8 +405,8 @@ impl Needs {
         let (metal, subsurface) = (largest(&activated.metalness), largest(&activated.subsurfaceness));
         let nil = |what: &str, value: f32| format!("nil: the largest {what} is {value:.1e}, at most {NIL}");
         let subsurface = self.residual_channels.clone().only_if(subsurface > NIL, &nil("subsurfaceness", subsurface));
-        let reads_visibility =
-            self.shadows.needed || (self.network.needed || self.medium.needed) && (subsurface.needed || self.incident_head.needed);
+        let reads_visibility = self.shadows.needed
+            || (self.network.needed || self.medium.needed) && (subsurface.needed || self.incident_head.needed);
         RenderNeeds {
             metal: self.metalness_channel.clone().only_if(metal > NIL, &nil("metalness", metal)),
             incident: self.incident_head.clone(),

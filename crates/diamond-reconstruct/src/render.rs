@@ -9,10 +9,10 @@
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
 use crate::forward::{Settings, raster_config};
+use crate::medium_term::white;
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
-use crate::medium_term::white;
 use crate::visibility_cache::{LightKey, Tracer, key};
 use crate::{Activated, CaptureFacts, MediumTerm, Model, Needs, ReconstructError, Rendering, error};
 use diamond_camera::Camera;
@@ -542,7 +542,8 @@ impl ViewHalf {
                 let lit = lights.iter().zip(&lamps).zip(&leaving);
                 for (to, ((light, lamp), leaving)) in to.chunks_exact_mut(self.channels.per_light).zip(lit) {
                     let (i, visibility) = (self.rows.visible[row] as usize, light.1.get(row).copied().unwrap_or(0.0));
-                    let rgb = medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility, toward);
+                    let rgb =
+                        medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility, toward);
                     to[place..place + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
                 }
             };

@@ -66,7 +66,8 @@ pub(crate) fn pull_to_nothing(
     let value = scale * sum.iter().map(|r| r * r).sum::<f32>();
     let d: Vec<f32> = sum.iter().map(|r| 2.0 * weight * scale * r).collect();
     if let Some((network, matrix, pullback)) = &assembled {
-        let pulled = network.pullback(matrix, rows.len()).and_then(|p| p.pull(&d, &[], model.config.residual.codes > 0));
+        let pulled =
+            network.pullback(matrix, rows.len()).and_then(|p| p.pull(&d, &[], model.config.residual.codes > 0));
         let mut grad = pulled.map_err(error::stage("residual network.pull"))?;
         if let Some(d_inputs) = grad.inputs.take() {
             let codes = model.config.residual.codes;

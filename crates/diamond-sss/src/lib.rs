@@ -21,6 +21,7 @@ mod evaluation;
 mod export;
 mod geometry_score;
 mod inspect;
+mod inspect_medium;
 mod light_choice;
 mod memory;
 mod metrics_file;
@@ -44,6 +45,7 @@ pub use evaluation::{FittedGain, HeldOutGain, ImageScore, PSNR_CAP, Scored, eval
 pub use export::{ExportOptions, Exported, convert_splats, export_model, is_splat_file, parse_turn};
 pub use geometry_score::{SHAPE_METRICS, ShapeScores, ViewShape, shape_scores};
 pub use inspect::{inspect_picture, inspect_text};
+pub use inspect_medium::{MediumReport, edit_medium, inspect_medium};
 pub use light_choice::{LightChoice, LightMix, parse_mix, parse_vec3};
 pub use memory::{AtOnce, MemoryPlan, Moment, Part, Refused, moments};
 pub use metrics_file::{Metrics, Summary, evaluate_folder};

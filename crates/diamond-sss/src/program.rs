@@ -97,6 +97,12 @@ fn run(command: Command) -> Result<(), SssError> {
             }
             Ok(())
         }
+        Command::InspectMedium { dir, medium, output } => {
+            let report = diamond_sss::inspect_medium(&dir, medium.as_deref(), output.as_deref())?;
+            print(&report.text);
+            print(&format!("written: {}\n", report.plot.display()));
+            Ok(())
+        }
         Command::Export { dir, output, materials, writing } => {
             let exported = diamond_sss::export_model(&dir, &output, &writing.options(materials))?;
             report_export(&output, &exported);
@@ -158,6 +164,7 @@ fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {
         cameras,
         lights,
         size: a.size,
+        medium: a.medium,
         linear: a.linear,
         exposure: a.exposure,
     })

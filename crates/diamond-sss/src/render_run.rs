@@ -21,6 +21,8 @@ pub struct RenderOptions {
     pub lights: LightChoice,
     /// Width and height, pixels; the camera's where absent.
     pub size: Option<(u32, u32)>,
+    /// Another medium: a TOML file, or changes such as `mean_free_path=*2`.
+    pub medium: Option<String>,
     /// Linear light as EXR instead of sRGB as PNG.
     pub linear: bool,
     /// Stops by which pictures are brighter than the model says; every stop doubles the radiance.
@@ -32,7 +34,11 @@ pub fn render_folder(
     options: &RenderOptions,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<PathBuf>, SssError> {
-    let model = Model::load(&options.folder)?;
+    let mut model = Model::load(&options.folder)?;
+    if let Some(changes) = &options.medium {
+        crate::edit_medium(&mut model, changes)?;
+    }
+    let model = model;
     let record = RunRecord::read(&options.folder)?;
     let run_file = options.folder.join(crate::run_record::RUN_FILE);
     let rig: Vec<OlatLight> = match &record {

@@ -4,4 +4,5 @@ mod light_control;
 mod maps;
 mod page;
 
+pub(crate) use chart::curves;
 pub use page::write_report;

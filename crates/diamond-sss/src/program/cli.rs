@@ -78,6 +78,24 @@ diamond inspect bunny.spz -o bunny.png")]
         #[arg(short, long)]
         output: Option<PathBuf>,
     },
+    /// Say what was found about the inside of the object: sigma_t, albedo, how far light goes; with a plot
+    #[command(after_help = "Examples:
+  diamond inspect-medium out
+  diamond inspect-medium out --medium \"mean_free_path=*2\" -o softer.svg
+
+The medium is DIR/medium.toml, for people to read and change: diamond render DIR --medium changed.toml.
+Keys of --medium: mean_free_path (all distances), reflectance (a profile), sigma_t, albedo, g, gain (walks),
+roughness, coat. One number or three (red green blue); *2 multiplies what is there.")]
+    InspectMedium {
+        /// Folder of a finished reconstruction
+        dir: PathBuf,
+        /// With another medium: a TOML file, or changes
+        #[arg(long, value_name = "FILE|KEY=VALUE,…")]
+        medium: Option<String>,
+        /// Where the plot goes (SVG) [default: DIR/medium.svg]
+        #[arg(short, long)]
+        output: Option<PathBuf>,
+    },
     /// Write the Gaussians of a model for other programs
     #[command(
         after_help = "Examples:\n  diamond export out -o splats.ply\n  diamond export out -o splats.ply --materials\n  \
@@ -260,6 +278,7 @@ pub struct ReconstructArguments {
   diamond render out -o film --orbit 60 --direction 0,0,1
   diamond render out -o picture.png --mix \"4,0,2:1,0.6,0.3;-4,0,2:0.3,0.6,1\"
   diamond render out -o rig --capture capture --view 2 --lights 16
+  diamond render out -o softer.png --medium \"mean_free_path=*2\"
   diamond render out -o picture.exr --linear --size 512x512")]
 pub struct RenderArguments {
     /// Folder of a finished reconstruction
@@ -291,6 +310,9 @@ pub struct RenderArguments {
     /// So many lights of an even dome, one picture each
     #[arg(long, group = "under", value_parser = at_least_one)]
     pub lights: Option<usize>,
+    /// Another medium inside: a TOML file, or changes such as "mean_free_path=*2, reflectance=0.9 0.5 0.5" (see inspect-medium)
+    #[arg(long, value_name = "FILE|KEY=VALUE,…")]
+    pub medium: Option<String>,
     /// Size of the pictures, WIDTHxHEIGHT
     #[arg(long, value_parser = size)]
     pub size: Option<(u32, u32)>,

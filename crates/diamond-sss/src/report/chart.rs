@@ -87,6 +87,59 @@ pub fn chart(title: &str, unit: &str, points: &[(f64, f64)], from_zero: bool) ->
     out
 }
 
+/// A file with several curves over a logarithmic axis from above 0, with a legend: (name, colour, points).
+pub fn curves(title: &str, across: &str, up: &str, curves: &[(&str, &str, Vec<(f64, f64)>)]) -> String {
+    const W: f64 = 640.0;
+    const H: f64 = 360.0;
+    let all = || curves.iter().flat_map(|c| &c.2).filter(|p| p.0 > 0.0 && p.0.is_finite() && p.1.is_finite());
+    let fold = |f: fn(f64, f64) -> f64, start: f64, of: fn(&(f64, f64)) -> f64| all().map(of).fold(start, f);
+    let (left, right) = (fold(f64::min, f64::INFINITY, |p| p.0), fold(f64::max, 0.0, |p| p.0));
+    let high = fold(f64::max, 0.0, |p| p.1).max(1e-9);
+    let step = tick(high);
+    let high = (high / step).ceil() * step;
+    let span = (right / left).ln().max(1e-9);
+    let x = |v: f64| 64.0 + (v / left).ln() / span * (W - 84.0);
+    let y = |v: f64| H - 52.0 - v / high * (H - 96.0);
+    let mut out = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {W} {H}\" font-family=\"sans-serif\" font-size=\"12\">\
+         <rect width=\"{W}\" height=\"{H}\" fill=\"white\"/><text x=\"64\" y=\"22\" font-size=\"15\">{title}</text>"
+    );
+    // Writing to a string cannot fail.
+    let mut v = 0.0;
+    while v <= high * (1.0 + 1e-9) {
+        let _ = write!(
+            out,
+            "<line x1=\"64\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\" stroke=\"#ddd\"/><text x=\"58\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
+            W - 20.0, y(v), y(v), y(v) + 4.0, label(v)
+        );
+        v += step;
+    }
+    for power in -6..=6 {
+        for lead in [1.0, 2.0, 5.0] {
+            let v = lead * 10f64.powi(power);
+            if v >= left && v <= right {
+                let _ = write!(out, "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>", x(v), H - 34.0, label(v));
+            }
+        }
+    }
+    let _ = write!(
+        out,
+        "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{across}</text><text x=\"64\" y=\"38\" fill=\"#555\">{up}</text>",
+        0.5 * W, H - 12.0
+    );
+    for (k, (name, colour, points)) in curves.iter().enumerate() {
+        let usable = points.iter().filter(|p| p.0 > 0.0 && p.0.is_finite() && p.1.is_finite());
+        let path: Vec<String> = usable.map(|p| format!("{:.1},{:.1}", x(p.0), y(p.1))).collect();
+        let _ = write!(
+            out,
+            "<polyline fill=\"none\" stroke=\"{colour}\" stroke-width=\"2\" points=\"{}\"/><text x=\"{:.1}\" y=\"22\" fill=\"{colour}\">{name}</text>",
+            path.join(" "),
+            W - 190.0 + 56.0 * k as f64
+        );
+    }
+    out + "</svg>\n"
+}
+
 /// Means over neighbours, so that at most `count` points remain and single steps do not hide the course.
 pub fn smooth(points: &[(f64, f64)], count: usize) -> Vec<(f64, f64)> {
     let size = points.len().div_ceil(count.max(1)).max(1);
@@ -104,6 +157,10 @@ mod tests {
                 let svg = chart("t", "dB", &data, zero);
                 assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
             }
+        }
+        for data in [vec![], vec![(0.0, 1.0)], vec![(1.0, f64::NAN)], vec![(0.1, 0.2), (1.0, 0.0)]] {
+            let svg = curves("t", "x", "y", &[("a", "red", data)]);
+            assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.ends_with("</svg>\n"), "{svg}");
         }
         assert_eq!(smooth(&[(1.0, 1.0), (2.0, 3.0), (3.0, 5.0)], 2), [(2.0, 2.0), (3.0, 5.0)]);
     }
