@@ -450,3 +450,126 @@ fn place(to: &mut [f64], widths: &[f32], reflectance: f32, mean_free_path: f32) 
     one.on_widths(widths)?.weights.iter().zip(to).for_each(|(w, to)| *to = f64::from(w.x));
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Exitance, fit_walk};
+    use diamond_camera::{Intrinsics, Pose};
+    use diamond_pathtrace::Mesh;
+
+    fn surface() -> Surface {
+        // No sphere, on which every place is like every other.
+        let mut mesh = Mesh::icosphere(Vec3::ZERO, 1.0, 4);
+        mesh.positions.iter_mut().for_each(|p| *p *= Vec3::new(1.0, 0.7, 0.5));
+        Surface::new(mesh, 900).unwrap()
+    }
+
+    fn cameras() -> Vec<Camera> {
+        let intrinsics = Intrinsics::from_fov_x(0.8, 40, 40);
+        let eyes = [Vec3::new(0.5, 0.2, 3.0), Vec3::new(3.0, -0.5, 0.4)];
+        eyes.iter().map(|e| Camera { intrinsics, pose: Pose::look_at(*e, Vec3::ZERO, Vec3::Y) }).collect()
+    }
+
+    fn light(at: Vec3) -> OlatLight {
+        OlatLight::Point { position: at, intensity: Vec3::new(9.0, 9.0, 9.0) }
+    }
+
+    /// The picture of a medium, without a coat.
+    fn picture(surface: &Surface, medium: &Medium, camera: &Camera, lamp: &OlatLight) -> Image {
+        let exitance = Exitance::new(surface, medium).unwrap();
+        let falloff = Falloff::InverseSquare { reference: 1.0 };
+        let leaving = exitance.under(surface, &[*lamp], falloff).unwrap();
+        let image = Image::new(40, 40, 3);
+        let fit = FitImage { camera, light: lamp, radiance: &image, mask: None, tint: None, known: None };
+        let places = seen(surface, &fit, 1);
+        let positions: Vec<Vec3> = places.iter().map(|s| s.position).collect();
+        let normals: Vec<Vec3> = places.iter().map(|s| s.normal).collect();
+        let attachment = surface.attach(&positions, &normals);
+        let own = irradiance(surface, &positions, &normals, &[white(lamp)], falloff).unwrap();
+        let mut out = Image::new(40, 40, 3);
+        for (n, place) in places.iter().enumerate() {
+            let toward = exitance.toward(place.shading.dot(place.toward_eye));
+            let rgb = attachment.rgb(n, &leaving[0]) * toward + medium.local() * own[n];
+            out.data_mut()[3 * place.pixel..][..3].copy_from_slice(&(rgb * intensity(lamp)).to_array());
+        }
+        out
+    }
+
+    fn fitted(surface: &Surface, truth: &Medium, walk: bool) -> Medium {
+        let (cameras, lamps) = (cameras(), [light(Vec3::new(1.0, 1.5, 2.5)), light(Vec3::new(2.5, -1.0, 0.5))]);
+        let pairs: Vec<(&Camera, &OlatLight)> = cameras.iter().flat_map(|c| lamps.iter().map(move |l| (c, l))).collect();
+        let pictures: Vec<Image> = pairs.iter().map(|(c, l)| picture(surface, truth, c, l)).collect();
+        let each = pairs.iter().zip(&pictures);
+        let images: Vec<FitImage<'_>> = each
+            .map(|((camera, light), radiance)| FitImage { camera, light, radiance, mask: None, tint: None, known: None })
+            .collect();
+        let options = FitOptions { falloff: Falloff::InverseSquare { reference: 1.0 }, ..FitOptions::default() };
+        if walk { fit_walk(surface, &images, &options) } else { fit_profile(surface, &images, &options) }.unwrap()
+    }
+
+    fn medium(transport: Transport) -> Medium {
+        Medium { unit: 1.0, transport, coat: Coat { roughness: 0.3, scale: 0.0 }, quality: None, described: None }
+    }
+
+    /// Difference under a light and from a place that were not fitted, relative.
+    fn elsewhere(surface: &Surface, truth: &Medium, found: &Medium) -> f64 {
+        let intrinsics = Intrinsics::from_fov_x(0.8, 40, 40);
+        let camera = Camera { intrinsics, pose: Pose::look_at(Vec3::new(-2.0, 1.0, 2.0), Vec3::ZERO, Vec3::Y) };
+        let lamp = light(Vec3::new(-2.5, 0.5, -1.0));
+        let (a, b) = (picture(surface, truth, &camera, &lamp), picture(surface, found, &camera, &lamp));
+        let square = |v: f32| f64::from(v) * f64::from(v);
+        let difference: f64 = a.data().iter().zip(b.data()).map(|(a, b)| square(a - b)).sum();
+        (difference / a.data().iter().map(|v| square(*v)).sum::<f64>()).sqrt()
+    }
+
+    #[test]
+    fn a_profile_is_found_again_and_holds_for_other_lights() {
+        let surface = surface();
+        let widths = offered_widths(&surface, &FitOptions::default());
+        let mut weights = vec![[0.0f32; 3]; widths.len()];
+        (weights[3], weights[7]) = ([0.3, 0.2, 0.2], [0.5, 0.3, 0.1]);
+        let truth = medium(Transport::Profile { widths, weights, local: [0.1, 0.0, 0.2] });
+        let found = fitted(&surface, &truth, false);
+        let quality = found.quality.unwrap();
+        assert!(quality.psnr > 40.0, "{quality:?}");
+        let off = (found.reflectance() - truth.reflectance()).abs().max_element();
+        assert!(off < 0.05, "{found:?}");
+        let relative = elsewhere(&surface, &truth, &found);
+        assert!(relative < 0.02, "{relative}");
+        assert!(found.remarks(surface.spacing()).is_empty(), "{:?}", found.remarks(surface.spacing()));
+    }
+
+    #[test]
+    fn walks_are_found_again_and_hold_for_other_lights() {
+        let surface = surface();
+        let transport =
+            Transport::Walk { sigma_t: [10.0; 3], albedo: [0.97, 0.9, 0.7], g: 0.0, ior: 1.0, gain: [1.0; 3] };
+        let truth = medium(transport);
+        let found = fitted(&surface, &truth, true);
+        let Transport::Walk { sigma_t, albedo, gain, .. } = found.transport else { panic!("{found:?}") };
+        // On a coarse list of σ_t, which albedo and gain make up for.
+        assert!(sigma_t.iter().all(|s| (6.0..17.0).contains(s)) && (0.7..1.4).contains(&gain[0]), "{found:?}");
+        assert!(albedo[0] > albedo[1] && albedo[1] > albedo[2] && (albedo[1] - 0.9).abs() < 0.07, "{found:?}");
+        let relative = elsewhere(&surface, &truth, &found);
+        assert!(relative < 0.06, "{relative}");
+    }
+
+    #[test]
+    fn photographs_that_show_nothing_are_an_error() {
+        let surface = surface();
+        let intrinsics = Intrinsics::from_fov_x(0.3, 16, 16);
+        let away = Camera { intrinsics, pose: Pose::look_at(Vec3::Z * 4.0, Vec3::Z * 9.0, Vec3::Y) };
+        let (black, lamp) = (Image::new(16, 16, 3), light(Vec3::Z * 4.0));
+        let image = FitImage { camera: &away, light: &lamp, radiance: &black, mask: None, tint: None, known: None };
+        for images in [&[image][..], &[]] {
+            assert!(fit_profile(&surface, images, &FitOptions::default()).is_err());
+        }
+        // All black photographs have the medium that returns nothing, and the user is told.
+        let there = Camera { intrinsics, pose: Pose::look_at(Vec3::Z * 4.0, Vec3::ZERO, Vec3::Y) };
+        let image = FitImage { camera: &there, ..image };
+        let found = fit_profile(&surface, &[image], &FitOptions::default()).unwrap();
+        assert_eq!(found.reflectance(), Vec3::ZERO);
+        assert!(found.remarks(surface.spacing()).iter().any(|r| r.contains("hardly any light")));
+    }
+}

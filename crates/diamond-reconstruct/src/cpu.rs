@@ -312,7 +312,8 @@ impl Engine for CpuEngine {
         }
         let t = self.profile.add("adam", t);
         let density = self.control_density(step, plan)?;
-        if plan.densify || (step + 1).is_multiple_of(ATTACH_STEPS) {
+        let last = step + 1 == self.model.config.steps;
+        if plan.densify || last || (step + 1).is_multiple_of(ATTACH_STEPS) {
             let model = &mut self.model;
             if let Some(medium) = &mut model.medium {
                 medium.attach(&model.parameters.activate());

@@ -57,6 +57,15 @@ impl MediumRows {
     }
 }
 
+/// Where a Gaussian is, and how it is seen.
+pub(crate) struct MediumPlace {
+    pub gaussian: usize,
+    pub position: Vec3,
+    pub normal: Vec3,
+    /// See [`MediumTerm::toward`].
+    pub toward: Vec3,
+}
+
 /// The gradient that reaches the Gaussians of the rows.
 pub(crate) struct MediumRowsGrad {
     pub positions: Vec<Vec3>,
@@ -256,41 +265,32 @@ impl MediumTerm {
         tints: Vec<Vec3>,
     ) -> Result<MediumRows, ReconstructError> {
         let leaving = &self.leaving(&[*light])?[0];
-        let lamp = [white(light)];
-        let (local, scale) = (self.local(), 1.0 / whole());
-        let own = match local {
-            Vec3::ZERO => Vec::new(),
-            _ => Self::lighting(rows, lit, &lamp).irradiance().map_err(error::stage("medium"))?,
-        };
-        let untinted = rows.visible.iter().enumerate().map(|(row, &i)| {
-            let around = self.attachment.rgb(i as usize, leaving) * self.over_falloff(&lamp[0], rows.positions[row]);
-            let toward = self.exitance.toward(rows.normals[row].dot(rows.view_directions[row]));
-            around * toward * scale + own.get(3 * row).map_or(Vec3::ZERO, |e| local * *e)
+        let lamp = white(light);
+        let untinted = (0..rows.len()).map(|row| {
+            let place = MediumPlace {
+                gaussian: rows.visible[row] as usize,
+                position: rows.positions[row],
+                normal: rows.normals[row],
+                toward: self.toward(rows.normals[row], rows.view_directions[row]),
+            };
+            self.untinted(&place, &lamp, leaving, lit.visibility[row])
         });
         Ok(MediumRows { untinted: untinted.collect(), tints })
     }
 
     /// One over the falloff of a light at a place.
-    pub(crate) fn over_falloff(&self, white: &OlatLight, at: Vec3) -> f32 {
+    fn over_falloff(&self, white: &OlatLight, at: Vec3) -> f32 {
         let falls = white.incidence(at, self.falloff).irradiance.x;
         if falls > f32::MIN_POSITIVE { 1.0 / falls } else { 0.0 }
     }
 
-    /// Adds to `out` what one row sends out under each of several lights with known surfels: for the renderer, which goes row by row.
-    pub(crate) fn residual_at(
-        &self,
-        gaussian: usize,
-        position: Vec3,
-        normal: Vec3,
-        tint: Vec3,
-        lamp: &OlatLight,
-        leaving: &[f32],
-        visibility: f32,
-        toward: Vec3,
-    ) -> Vec3 {
-        let around = self.attachment.rgb(gaussian, leaving) * toward * self.over_falloff(lamp, position);
-        let cos_theta_i = normal.dot(lamp.incidence(position, Falloff::None).direction).max(0.0);
-        tint * (around * (1.0 / whole()) + self.local() * (visibility * cos_theta_i))
+    /// What the medium sends out of a Gaussian under a lamp of intensity 1 with known surfels, over the lamp's falloff there and before the tint:
+    /// [eq:medium-residual] (Σ_j w_j·L_j·A(n·v)/falloff + local·visibility·max(0, n·l)/π)/s₀, linear RGB.
+    #[inline]
+    pub(crate) fn untinted(&self, at: &MediumPlace, lamp: &OlatLight, leaving: &[f32], visibility: f32) -> Vec3 {
+        let around = self.attachment.rgb(at.gaussian, leaving) * at.toward * self.over_falloff(lamp, at.position);
+        let cos_theta_i = at.normal.dot(lamp.incidence(at.position, Falloff::None).direction).max(0.0);
+        around * (1.0 / whole()) + self.local() * (visibility * cos_theta_i)
     }
 
     /// Pullback of [`MediumTerm::rows`] (tinted) to positions and normals, through what leaves where it enters, and to base colours. `d` is rows × 3.
@@ -311,6 +311,7 @@ impl MediumTerm {
             return Ok(MediumRowsGrad { positions: none.clone(), normals: none, base_color });
         }
         // All channels see the same scalar irradiance; the cotangent goes to the first.
+        // [eq:medium-residual]
         let d_own: Vec<f32> =
             (0..rows.len()).flat_map(|row| [(rgb(row) * medium.tints[row]).dot(local), 0.0, 0.0]).collect();
         let grad = Self::lighting(rows, lit, &lamp).pull(&d_own).map_err(error::stage("medium.pull"))?;
@@ -395,5 +396,96 @@ impl Model {
         let (positions, normals): (Vec<Vec3>, Vec<Vec3>) = pieces.iter().map(|p| (p.position, p.normal)).unzip();
         term.attachment = term.surface.attach(&positions, &normals);
         Ok(sources)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_medium::{Coat, Transport};
+    use diamond_testkit::adjoint::adjoint_gap;
+    use diamond_testkit::{Real, jvp};
+
+    fn term(positions: &[Vec3], normals: &[Vec3]) -> MediumTerm {
+        let surface = Surface::new(Mesh::icosphere(Vec3::ZERO, 1.0, 3), 400).unwrap();
+        let transport = Transport::Profile {
+            widths: vec![0.2, 0.5],
+            weights: vec![[0.3, 0.2, 0.1], [0.4, 0.1, 0.2]],
+            local: [0.2, 0.3, 0.4],
+        };
+        let coat = Coat { roughness: 0.3, scale: 1.0 };
+        let medium = Medium { unit: 1.0, transport, coat, quality: None, described: None };
+        MediumTerm::new(surface, medium, Falloff::None, positions, normals).unwrap()
+    }
+
+    /// [eq:medium-residual] Value and pullback to position, normal and base colour against dual numbers.
+    #[test]
+    fn rows_and_their_pullback_agree_with_the_oracle() {
+        let positions = vec![Vec3::new(0.1, 0.2, 0.97), Vec3::new(-0.6, 0.3, 0.74)];
+        let normals: Vec<Vec3> = positions.iter().map(|p| (*p + Vec3::new(0.2, -0.1, 0.0)).normalize()).collect();
+        let term = term(&positions, &normals);
+        let rows = Rows {
+            visible: vec![0, 1],
+            positions: positions.clone(),
+            rotations: vec![Quat::IDENTITY; 2],
+            scales: vec![Vec3::ONE; 2],
+            normals: normals.clone(),
+            view_directions: normals.clone(),
+            codes: Vec::new(),
+            transfer: Vec::new(),
+        };
+        let light = OlatLight::Point { position: Vec3::new(1.0, 2.0, 3.0), intensity: Vec3::new(2.0, 3.0, 4.0) };
+        let lit = LightRows { visibility: vec![0.7, 0.9], directions: vec![Vec3::Z; 2], distances: vec![1.0; 2] };
+        let base = [Vec3::new(0.4, 0.5, 0.6), Vec3::new(0.7, 0.2, 0.5)];
+        let medium = term.rows(&rows, &lit, &light, base.iter().map(|b| *b * TINT).collect()).unwrap();
+        let leaving = term.leaving(&[light]).unwrap();
+        let tangent = [0.3, -0.5, 0.2, 0.4, 0.1, -0.7, 0.9, -0.2, 0.6];
+        let cotangent = [0.8f32, -0.3, 0.5];
+        for row in 0..2 {
+            let around = term.attachment.rgb(row, &leaving[0]).to_array().map(f64::from);
+            let (local, whole) = ([0.2, 0.3, 0.4].map(|v| v / std::f64::consts::PI), f64::from(whole()));
+            let visibility = f64::from(lit.visibility[row]);
+            let x: Vec<f64> = [positions[row], normals[row], base[row]]
+                .iter()
+                .flat_map(|v| v.to_array())
+                .map(f64::from)
+                .collect();
+            let f = |x: &[diamond_testkit::Dual]| {
+                let of = |v: f64| diamond_testkit::Dual::of(v);
+                let to: Vec<_> = [1.0, 2.0, 3.0].iter().zip(&x[..3]).map(|(l, p)| of(*l) - *p).collect();
+                let length = (to[0] * to[0] + to[1] * to[1] + to[2] * to[2]).sqrt();
+                let cosine = (to[0] * x[3] + to[1] * x[4] + to[2] * x[5]) / length;
+                (0..3)
+                    .map(|c| of(2.0 / whole) * x[6 + c] * (of(around[c]) + of(local[c] * visibility) * cosine))
+                    .collect()
+            };
+            let duals: Vec<diamond_testkit::Dual> = x.iter().map(|v| diamond_testkit::Dual::of(*v)).collect();
+            for (c, value) in f(&duals).iter().enumerate() {
+                let found = f64::from(medium.residual(row)[c]);
+                assert!((found - value.v).abs() <= 1e-5 * value.v.abs(), "{found} {}", value.v);
+            }
+            let mut d = [0.0f32; 6];
+            d[3 * row..3 * row + 3].copy_from_slice(&cotangent);
+            let grad = term.pull(&rows, &lit, &light, &medium, &d).unwrap();
+            let vjp: Vec<f64> = [grad.positions[row], grad.normals[row], grad.base_color[row]]
+                .iter()
+                .flat_map(|v| v.to_array())
+                .map(f64::from)
+                .collect();
+            let gap = adjoint_gap(&cotangent.map(f64::from), &jvp(f, &x, &tangent), &vjp, &tangent);
+            assert!(gap <= 1e-4, "{gap}");
+            // Seen to fail: with one part missing.
+            let broken: Vec<f64> = vjp.iter().enumerate().map(|(i, v)| if i == 4 { 0.0 } else { *v }).collect();
+            assert!(adjoint_gap(&cotangent.map(f64::from), &jvp(f, &x, &tangent), &broken, &tangent) > 1e-3);
+        }
+    }
+
+    #[test]
+    fn what_leaves_is_linear_in_the_light_and_known_lights_are_kept() {
+        let term = term(&[Vec3::Z], &[Vec3::Z]);
+        let light = |intensity: f32| OlatLight::Point { position: Vec3::Z * 3.0, intensity: Vec3::splat(intensity) };
+        let one = term.leaving(&[light(1.0), light(5.0)]).unwrap();
+        assert!(Arc::ptr_eq(&one[0], &one[1]) && Arc::ptr_eq(&one[0], &term.leaving(&[light(2.0)]).unwrap()[0]));
+        assert!(one[0].iter().all(|v| v.is_finite() && *v >= 0.0) && one[0].iter().any(|v| *v > 0.1));
     }
 }

@@ -9,7 +9,7 @@
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
 use crate::forward::{Settings, raster_config};
-use crate::medium_term::white;
+use crate::medium_term::{MediumPlace, white};
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
@@ -536,15 +536,16 @@ impl ViewHalf {
             let put = |row: usize, values: &[f32]| {
                 let to = &mut piece[(row - first) * width..][..width];
                 to.copy_from_slice(values);
-                let (Some(medium), Some(place)) = (medium, self.channels.places.residual) else { return };
+                let (Some(medium), Some(at)) = (medium, self.channels.places.residual) else { return };
                 let (position, normal) = (self.rows.positions[row], self.rows.normals[row]);
+                let gaussian = self.rows.visible[row] as usize;
                 let toward = medium.toward(normal, self.rows.view_directions[row]);
+                let place = MediumPlace { gaussian, position, normal, toward };
                 let lit = lights.iter().zip(&lamps).zip(&leaving);
                 for (to, ((light, lamp), leaving)) in to.chunks_exact_mut(self.channels.per_light).zip(lit) {
-                    let (i, visibility) = (self.rows.visible[row] as usize, light.1.get(row).copied().unwrap_or(0.0));
-                    let rgb =
-                        medium.residual_at(i, position, normal, self.tints[row], lamp, leaving, visibility, toward);
-                    to[place..place + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
+                    let visibility = light.1.get(row).copied().unwrap_or(0.0);
+                    let rgb = medium.untinted(&place, lamp, leaving, visibility) * self.tints[row];
+                    to[at..at + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
                 }
             };
             self.lit.task(task, level, lights, &self.channels, put).map_err(error::stage("residual network"))

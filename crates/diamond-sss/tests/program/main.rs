@@ -7,6 +7,7 @@ mod changed_capture;
 mod disk;
 mod exposure;
 mod killed;
+mod medium;
 #[cfg(unix)]
 mod memory_limit;
 mod sessions;
