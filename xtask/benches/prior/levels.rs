@@ -160,7 +160,7 @@ pub fn bulk(case: &Case, walks: u32) -> Result<Pictures, String> {
     if case.refracts() {
         let mut black = case.scene.clone();
         black.material.medium.albedo = Vec3::ZERO;
-        let surface = render(&black, &BulkOptions { walks: 1, points: 16, ..options })?;
+        let surface = render(&black, &options)?;
         for (picture, surface) in pictures.iter_mut().zip(&surface) {
             picture.iter_mut().zip(surface).for_each(|(p, s)| *p -= s);
         }
