@@ -27,6 +27,7 @@
 //! # Ok::<(), diamond_pathtrace::PathtraceError>(())
 //! ```
 mod connect;
+mod entering_kernel;
 mod record;
 
 use crate::bulk::points::SurfacePoints;

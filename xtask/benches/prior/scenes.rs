@@ -176,7 +176,8 @@ impl Film {
     pub fn starts(&self) -> (Vec<WalkStart>, Vec<(usize, f32)>) {
         let some = |(pixel, rays): (usize, &Vec<FilmRay>)| {
             let step = rays.len().div_ceil(4).max(1);
-            let chosen: Vec<WalkStart> = rays.iter().skip(step / 2).step_by(step).map(|r| r.start).collect();
+            let chosen: Vec<WalkStart> =
+                rays.iter().skip((pixel + pixel / SIDE as usize) % step).step_by(step).map(|r| r.start).collect();
             let share = rays.len() as f32 / (RAYS * RAYS) as f32 / chosen.len().max(1) as f32;
             chosen.into_iter().map(move |start| (start, (pixel, share)))
         };

@@ -1,4 +1,5 @@
 //! Walks that were recorded, under lamps.
+use super::entering_kernel::{EnteringKernel, MIN_INNER_COSINE};
 use super::record::{enclosing, kept};
 use super::{RadianceMoments, ViewWalks};
 use crate::bulk::directions::carried;
@@ -11,7 +12,6 @@ use crate::medium::henyey_greenstein;
 use crate::{Frame, Light, PathtraceError};
 use glam::Vec3;
 use rayon::prelude::*;
-use std::f32::consts::TAU;
 
 impl ViewWalks<'_> {
     /// What every start gets from every lamp through walks of each bin of scatterings, for lamps of colour 1: what a fit of the albedo
@@ -59,14 +59,14 @@ impl ViewWalks<'_> {
         });
     }
 
-    /// `[eq:entering-kernel]`
     fn connect_entrances(&self, lamps: &Lamps, values: &mut [f32], width: usize) {
         let Some((cone, points)) = &self.entrances else { return };
-        let lights = lamps.len();
+        let (lights, kernel) = (lamps.len(), EnteringKernel::new());
+        let kernel = &kernel;
         let rays: Vec<InnerRay> = points
             .points()
             .par_iter()
-            .flat_map_iter(|point| (0..lights).map(move |l| self.inner_ray(lamps, l, point, cone)))
+            .flat_map_iter(|point| (0..lights).map(move |l| self.inner_ray(lamps, l, point, cone, kernel)))
             .collect();
         let bins = self.bins.ends.len();
         // Radiance is smaller outside by the squared index.
@@ -74,12 +74,15 @@ impl ViewWalks<'_> {
         values.par_chunks_exact_mut(width).enumerate().with_min_len(4).for_each(|(k, h)| {
             for connection in &self.connections[self.starts[k]..self.starts[k + 1]] {
                 let direction = connection.direction();
-                let weight = scale / direction.z.max(MIN_INNER_COSINE);
+                if direction.z < MIN_INNER_COSINE {
+                    continue;
+                }
+                let weight = scale / direction.z;
                 let bin = self.bins.of[usize::from(connection.scatterings)] as usize;
                 let row = &rays[connection.entrance() * lights..][..lights];
                 for (ray, h) in row.iter().zip(h[bin..].iter_mut().step_by(bins)) {
                     if ray.power > 0.0 {
-                        *h += weight * ray.power * entering_kernel(ray.direction.dot(direction));
+                        *h += weight * ray.power * kernel.at(&ray.kernel, ray.direction.dot(direction), direction.z);
                     }
                 }
             }
@@ -87,16 +90,24 @@ impl ViewWalks<'_> {
     }
 
     /// A lamp's light just under the surface.
-    fn inner_ray(&self, lamps: &Lamps, lamp: usize, point: &SurfacePoint, cone: &Cone) -> InnerRay {
+    fn inner_ray(
+        &self,
+        lamps: &Lamps,
+        lamp: usize,
+        point: &SurfacePoint,
+        cone: &Cone,
+        kernel: &EnteringKernel,
+    ) -> InnerRay {
         let shine = lamps.shine(lamp, point.position);
         let cos = shine.direction.dot(point.normal);
         let (far, skip) = (shine.distance, point.primitive);
         if cos <= 0.0 || self.geometry.occluded(point.position, shine.direction, far, Facing::Entering, skip) {
-            return InnerRay { direction: Vec3::Z, power: 0.0 };
+            return InnerRay { direction: Vec3::Z, power: 0.0, kernel: [0.0; 3] };
         }
         let (passed, sum) = cone.pass(shine.direction, point.normal);
         let local = carried(sum, point.normal, Frame::new(point.smooth_normal));
-        InnerRay { direction: local.normalize_or(Vec3::Z), power: shine.factor * cos * passed }
+        let direction = local.normalize_or(Vec3::Z);
+        InnerRay { direction, power: shine.factor * cos * passed, kernel: kernel.around(direction.z) }
     }
 }
 
@@ -106,43 +117,6 @@ struct InnerRay {
     direction: Vec3,
     /// Power per area.
     power: f32,
-}
-
-/// Concentration of the kernel: at this value its noise is that of a lobe of some 15°.
-const CONCENTRATION: f32 = 8.0;
-
-/// Cosines that the kernel is divided by are at least this; behind a boundary light comes from a cone of larger ones.
-pub(crate) const MIN_INNER_COSINE: f32 = 0.1;
-
-/// What light from a direction counts for a walk whose direction differs from it by an angle of this cosine, in place of the Dirac function that no
-/// walk meets: a Fisher distribution times a + b·x, so that the integral over all directions is 1 and that of a linear function is its value at the
-/// centre. With A = coth κ − 1/κ the mean of x, and its variance V = 1 − 2A/κ − A²: b = (1 − A)/V, a = 1 − b·A.
-/// `[eq:entering-kernel]`
-#[inline]
-fn entering_kernel(x: f32) -> f32 {
-    // e^(−2κ) is nothing in `f32`: coth κ = 1.
-    const MEAN: f32 = 1.0 - 1.0 / CONCENTRATION;
-    const VARIANCE: f32 = 1.0 - 2.0 * MEAN / CONCENTRATION - MEAN * MEAN;
-    const B: f32 = (1.0 - MEAN) / VARIANCE;
-    const A: f32 = 1.0 - B * MEAN;
-    CONCENTRATION / TAU * (CONCENTRATION * (x - 1.0)).exp() * (A + B * x)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// `[eq:entering-kernel]`
-    #[test]
-    fn the_kernel_reproduces_linear_functions() {
-        let n = 200_000;
-        let (mut one, mut x_mean) = (0.0f64, 0.0f64);
-        for i in 0..n {
-            let x = (f64::from(i) + 0.5) / f64::from(n) * 2.0 - 1.0;
-            let value = f64::from(entering_kernel(x as f32)) * std::f64::consts::TAU * 2.0 / f64::from(n);
-            one += value;
-            x_mean += value * x;
-        }
-        assert!((one - 1.0).abs() < 1e-4 && (x_mean - 1.0).abs() < 1e-4, "{one} {x_mean}");
-    }
+    /// See [`EnteringKernel::around`].
+    kernel: [f32; 3],
 }

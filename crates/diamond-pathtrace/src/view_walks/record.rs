@@ -1,5 +1,5 @@
 //! Walks that remember where lamps could be connected with them.
-use super::connect::MIN_INNER_COSINE;
+use super::entering_kernel::MIN_INNER_COSINE;
 use super::{ViewWalkOptions, WalkStart};
 use crate::bulk::directions::carried;
 use crate::bulk::points::SurfacePoints;
