@@ -162,7 +162,7 @@ mod tests {
     use super::*;
     use crate::{CaptureFacts, Needs};
     use diamond_dataset::{OpenOptions, Selection};
-    use diamond_testkit::{Dual, gradient};
+    use diamond_testkit::{Dual, Real, gradient};
 
     /// [eq:guided-normal]: value and gradient against dual numbers.
     #[test]
@@ -247,7 +247,7 @@ mod tests {
             .map(|i| (aligned.values.data()[i] - truth.depth.data()[i]).abs())
             .collect();
         gaps.sort_by(f32::total_cmp);
-        assert!(gaps[gaps.len() / 2] < 0.06, "{} of a body of size 2", gaps[gaps.len() / 2]);
+        assert!(gaps[gaps.len() / 2] < 0.08, "{} of a body of size 2", gaps[gaps.len() / 2]);
         assert!(aligned_depth(found[0].as_ref().unwrap(), &truth.depth, &truth.depth.map(|_| 0.0)).is_none());
     }
 
