@@ -498,11 +498,19 @@ mod tests {
 
     fn fitted(surface: &Surface, truth: &Medium, walk: bool) -> Medium {
         let (cameras, lamps) = (cameras(), [light(Vec3::new(1.0, 1.5, 2.5)), light(Vec3::new(2.5, -1.0, 0.5))]);
-        let pairs: Vec<(&Camera, &OlatLight)> = cameras.iter().flat_map(|c| lamps.iter().map(move |l| (c, l))).collect();
+        let pairs: Vec<(&Camera, &OlatLight)> =
+            cameras.iter().flat_map(|c| lamps.iter().map(move |l| (c, l))).collect();
         let pictures: Vec<Image> = pairs.iter().map(|(c, l)| picture(surface, truth, c, l)).collect();
         let each = pairs.iter().zip(&pictures);
         let images: Vec<FitImage<'_>> = each
-            .map(|((camera, light), radiance)| FitImage { camera, light, radiance, mask: None, tint: None, known: None })
+            .map(|((camera, light), radiance)| FitImage {
+                camera,
+                light,
+                radiance,
+                mask: None,
+                tint: None,
+                known: None,
+            })
             .collect();
         let options = FitOptions { falloff: Falloff::InverseSquare { reference: 1.0 }, ..FitOptions::default() };
         if walk { fit_walk(surface, &images, &options) } else { fit_profile(surface, &images, &options) }.unwrap()

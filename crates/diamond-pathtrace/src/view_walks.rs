@@ -6,9 +6,8 @@
 //! - *index-matched*: some of its scatterings, with the direction in which the walk arrived. A lamp's light comes to a scattering straight, through
 //!   e^(−σ_t·length) of medium, and is scattered by the phase function. Scatterings that lie deep, to which little can come, are kept
 //!   with a small probability and count the more.
-//! - *refracting*: where it meets the surface from inside, and from which direction. A rough boundary sends some of each lamp's light against the
-//!   walk, and how much is known. A polished one, or one that is nearly so, does not, and has the kernel of the bulk renderer in its place: exact for
-//!   what is linear over the cone of directions that are seen from outside.
+//! - *refracting*: where it meets the surface from inside, and from which direction. Light that enters there goes against the walk, in a direction that
+//!   no walk has exactly; a kernel stands in its place that is exact for what is linear in the direction.
 //!
 //! A walk starts along the given ray, so that radiance is exact for that direction too; or in all directions, for radiosity. After n
 //! scatterings a connection brings αⁿ of its light, so radiance is Σ_b α^(n_b)·h_b ([`RadianceMoments`]) with h linear in light and independent
@@ -28,6 +27,7 @@
 //! # Ok::<(), diamond_pathtrace::PathtraceError>(())
 //! ```
 mod connect;
+mod entering_kernel;
 mod record;
 
 use crate::bulk::points::SurfacePoints;
@@ -98,7 +98,6 @@ pub struct ViewWalks<'a> {
     geometry: &'a Geometry,
     sigma_t: f32,
     g: f32,
-    boundary: Boundary,
     options: ViewWalkOptions,
     /// Of a boundary that refracts: what passes it, and the places where light enters.
     entrances: Option<(Box<Cone>, SurfacePoints)>,
@@ -171,7 +170,7 @@ impl<'a> ViewWalks<'a> {
                 Some((Box::new(cone), points))
             }
         };
-        let recorder = Recorder::new(geometry, sigma_t, g, boundary, *options, entrances.as_ref());
+        let recorder = Recorder::new(geometry, sigma_t, g, boundary, *options, entrances.as_ref().map(|e| &e.1));
         let done = AtomicUsize::new(0);
         let rows: Vec<(Vec<Connection>, u32)> = starts
             .par_iter()
@@ -203,8 +202,7 @@ impl<'a> ViewWalks<'a> {
         }
         cut /= (f64::from(options.walks) * starts.len() as f64).max(1.0);
         let bins = Bins::new(&histogram);
-        let boundary = boundary.effective();
-        Ok(Self { geometry, sigma_t, g, boundary, options: *options, entrances, starts: ends, connections, bins, cut })
+        Ok(Self { geometry, sigma_t, g, options: *options, entrances, starts: ends, connections, bins, cut })
     }
 
     /// Number of starts.

@@ -8,6 +8,7 @@ use crate::cpu::Profile;
 use crate::forward::raster_config;
 use crate::needs::StepNeeds;
 use crate::objective::TermValue;
+use crate::photometric::aligned_depth;
 use crate::{
     Activated, ConsistencyLabel, Counters, Model, Neighbour, ReconstructError, SettingDepthKind, SettingDetach,
     SettingPenalty, error,
@@ -19,6 +20,7 @@ use diamond_consistency::{
 };
 use diamond_image::{Image, Mask};
 use diamond_losses::Term;
+use diamond_photometric::PhotometricStereo;
 use diamond_splat::{Features, GaussiansGrad, Raster, RasterGrad, rasterize};
 use std::time::Instant;
 
@@ -41,6 +43,8 @@ pub struct Comparison<'a> {
     pub neighbour: Neighbour<'a>,
     /// The photograph's mask, where it has one.
     pub mask: Option<&'a Mask>,
+    /// Photometric stereo of the view, whose depth is to stand for the rendered one.
+    pub stereo: Option<&'a PhotometricStereo>,
     /// Factor on both weights: so many steps as one stands for.
     pub factor: f32,
     /// The pair's share of the batch.
@@ -98,7 +102,12 @@ pub fn agree(
         .map_err(error::stage("rasterize the other view"))?;
     let options = options(model, &other);
     let mask = comparison.mask.filter(|_| settings.label == ConsistencyLabel::Mask);
-    let from = ViewGeometry { camera, silhouette: &raster.opacity, depth: DepthSource::Rendered(&raster.depth), mask };
+    let estimated = comparison.stereo.and_then(|s| aligned_depth(s, &raster.depth, &raster.opacity));
+    let depth = match &estimated {
+        Some(map) => DepthSource::Estimated(map),
+        None => DepthSource::Rendered(&raster.depth),
+    };
+    let from = ViewGeometry { camera, silhouette: &raster.opacity, depth, mask };
     let to = ViewGeometry {
         camera: &other,
         silhouette: &seen.opacity,
@@ -175,7 +184,7 @@ mod tests {
         let nothing = Features { channels: 0, data: Vec::new() };
         let (raster, pullback) = rasterize(&from.gaussians, &nothing, &s.cameras[0], &raster_config(&s.model)).unwrap();
         let neighbour = Neighbour { camera: &s.cameras[1], seed: 3 };
-        let comparison = Comparison { neighbour, mask: None, factor: 1.0, share: 1.0 };
+        let comparison = Comparison { neighbour, mask: None, stereo: None, factor: 1.0, share: 1.0 };
         let (mut profile, mut counters) = (Profile::default(), Counters::default());
         let a =
             agree(&s.model, to, &s.cameras[0], &raster, &comparison, &s.needs, &mut profile, &mut counters).unwrap();

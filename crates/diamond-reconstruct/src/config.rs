@@ -61,6 +61,9 @@ pub struct Config {
     /// Agreement of views about shape.
     #[serde(default)]
     pub consistency: Consistency,
+    /// Photometric stereo of single views.
+    #[serde(default)]
+    pub photometric: Photometric,
     /// Density control.
     pub density: Density,
 }
@@ -713,6 +716,26 @@ impl Default for Consistency {
     }
 }
 
+/// Photometric stereo of views that have three photographs or more: what its normals and depth are used for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Photometric {
+    /// Whether the first normals are turned toward what the views say that see them.
+    pub initial: bool,
+    /// Weight of the rendered normals' squared distance from the estimated ones; 0 for none.
+    pub supervise: f32,
+    /// Fraction of the run at which that weight has faded to 0, evenly from the first step.
+    pub until: f32,
+    /// Whether the estimated depth stands for the photograph's view where views are compared (`[consistency]`).
+    pub depth: bool,
+}
+
+impl Default for Photometric {
+    fn default() -> Self {
+        Self { initial: false, supervise: 0.0, until: 0.5, depth: false }
+    }
+}
+
 /// How Gaussians are added, removed and moved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -958,6 +981,7 @@ impl Config {
             ("rates.mean_decay", self.rates.mean_decay),
             ("visibility.moved", self.visibility.moved),
             ("loss.ssim", self.loss.ssim),
+            ("photometric.until", self.photometric.until),
             ("consistency.from", self.consistency.from),
             ("consistency.until", self.consistency.until),
             ("consistency.target_scale", self.consistency.target_scale),
@@ -987,6 +1011,7 @@ impl Config {
         }
         let d = &self.density;
         let not_negative = [
+            ("photometric.supervise", self.photometric.supervise),
             ("exposure.prior", self.exposure.prior),
             ("density.gradient_threshold", d.gradient_threshold),
             ("density.percent_dense", d.percent_dense),

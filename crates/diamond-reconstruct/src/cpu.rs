@@ -227,6 +227,7 @@ impl Engine for CpuEngine {
                 comparison: pair.neighbour.map(|neighbour| Comparison {
                     neighbour,
                     mask: pair.mask,
+                    stereo: pair.guide.filter(|g| g.depth).map(|g| g.stereo),
                     factor: plan.consistency,
                     share,
                 }),

@@ -1,7 +1,7 @@
 //! What runs a training step and renders: the CPU now, a GPU later, behind one trait.
 use crate::objective::TermValue;
 use crate::region::Region;
-use crate::{MediumTerm, Model, ReconstructError, StepPlan, TensorFile};
+use crate::{Guide, MediumTerm, Model, ReconstructError, StepPlan, TensorFile};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask};
 use diamond_light::OlatLight;
@@ -38,6 +38,8 @@ pub struct TrainingPair<'a> {
     pub image: usize,
     /// Another training view for geometric consistency; `None` where there is none or this step compares nothing.
     pub neighbour: Option<Neighbour<'a>>,
+    /// What photometric stereo says of the view; `None` where it is not asked or cannot say.
+    pub guide: Option<Guide<'a>>,
 }
 
 /// What one training step did.

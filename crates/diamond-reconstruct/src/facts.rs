@@ -17,6 +17,8 @@ pub struct CaptureFacts {
     pub views: usize,
     /// Training images.
     pub images: usize,
+    /// Training images of the view that has most.
+    pub most_view_images: usize,
     /// Different lights of the training images.
     pub lights: usize,
     /// Whether every view has the same lights.
@@ -83,6 +85,7 @@ impl CaptureFacts {
         Ok(Self {
             views: capture.train.len(),
             images: shots.len(),
+            most_view_images: capture.train.iter().map(|v| v.shots.len()).max().unwrap_or(0),
             shared_rig: capture.shared_rig(Split::Train).is_some(),
             directional_lights: lights.iter().filter(|l| matches!(l, OlatLight::Directional { .. })).count(),
             lights: lights.len(),

@@ -8,8 +8,7 @@ use diamond_dataset::{Capture, Observation, Shot, View};
 use diamond_image::Image;
 use diamond_medium::{
     CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, fit_walk,
-    hull_bounds,
-    outward_normals,
+    hull_bounds, outward_normals,
 };
 use diamond_pathtrace::RepairOptions;
 use diamond_shading::pseudo_normals;

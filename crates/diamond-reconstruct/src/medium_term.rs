@@ -445,12 +445,9 @@ mod tests {
             let around = term.attachment.rgb(row, &leaving[0]).to_array().map(f64::from);
             let (local, whole) = ([0.2, 0.3, 0.4].map(|v| v / std::f64::consts::PI), f64::from(whole()));
             let visibility = f64::from(lit.visibility[row]);
-            let x: Vec<f64> = [positions[row], normals[row], base[row]]
-                .iter()
-                .flat_map(|v| v.to_array())
-                .map(f64::from)
-                .collect();
-            let f = |x: &[diamond_testkit::Dual]| {
+            let x: Vec<f64> =
+                [positions[row], normals[row], base[row]].iter().flat_map(|v| v.to_array()).map(f64::from).collect();
+            let f = |x: &[diamond_testkit::Dual]| -> Vec<diamond_testkit::Dual> {
                 let of = |v: f64| diamond_testkit::Dual::of(v);
                 let to: Vec<_> = [1.0, 2.0, 3.0].iter().zip(&x[..3]).map(|(l, p)| of(*l) - *p).collect();
                 let length = (to[0] * to[0] + to[1] * to[1] + to[2] * to[2]).sqrt();

@@ -123,6 +123,12 @@ needs! {
     silhouette_consistency: Term, "with depth_consistency a second view's opacity and depth, forward and backward";
     /// Depths of different views against each other.
     depth_consistency: Term, "with silhouette_consistency a second view's opacity and depth, forward and backward";
+    /// Rendered normals against those of photometric stereo.
+    guided_normal: Term, "photometric stereo of each view at the start, and one pass over the normals";
+    /// First normals from photometric stereo.
+    guided_start: Model, "photometric stereo of each view at the start";
+    /// Depth from photometric stereo where views are compared.
+    guided_depth: Model, "photometric stereo of each view at the start, and its alignment at each comparison";
     /// Roughness.
     roughness_channel: Channel, "1 of 14 channels, forward and backward";
     /// Metalness.
@@ -206,6 +212,11 @@ impl Needs {
         let ever_compared = (0..config.steps).any(|s| StepPlan::new(config, s).consistency > 0.0);
         let never_compared =
             "no step of the run is in consistency.from to until after the first round of density control";
+        let guide = &config.photometric;
+        // 0 where nothing is known of the capture.
+        let enough_lights = !(1..3).contains(&facts.most_view_images);
+        let few_lights = "photometric stereo needs three photographs of a view, and no view has more than two";
+        let compares = (loss.silhouette_consistency > 0.0 || loss.depth_consistency > 0.0) && facts.views != 1;
         let moved = config.visibility.moved;
         let density = match config.density.strategy {
             DensityStrategy::Adaptive => Decision::new(true, "density.strategy = \"adaptive\""),
@@ -246,6 +257,14 @@ impl Needs {
             depth_consistency: Decision::weight("loss.depth_consistency", loss.depth_consistency)
                 .only_if(facts.views != 1, one_view)
                 .only_if(ever_compared, never_compared),
+            guided_normal: Decision::weight("photometric.supervise", guide.supervise)
+                .only_if(guide.until > 0.0, "photometric.until = 0")
+                .only_if(enough_lights, few_lights),
+            guided_start: Decision::new(guide.initial, format!("photometric.initial = {}", guide.initial))
+                .only_if(enough_lights, few_lights),
+            guided_depth: Decision::new(guide.depth, format!("photometric.depth = {}", guide.depth))
+                .only_if(compares, "no depths are compared (loss.silhouette_consistency, loss.depth_consistency)")
+                .only_if(enough_lights, few_lights),
             roughness_channel: Decision::new(
                 shading.roughness_unfreeze < 1.0,
                 match shading.roughness_unfreeze {

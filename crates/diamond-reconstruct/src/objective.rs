@@ -6,6 +6,7 @@
 use crate::exposure::{expose, expose_pull, fitted_gain};
 use crate::forward::{PairGrad, View, ViewGrad};
 use crate::needs::StepNeeds;
+use crate::photometric::guided_normal;
 use crate::random::Random;
 use crate::{ActivatedGrad, Attribute, Config, Model, ReconstructError, TrainingPair, error};
 use diamond_image::{Image, Transfer};
@@ -199,6 +200,14 @@ pub fn evaluate(
             add_scaled(grad, &l.grad, scale * weight);
         }
     }
+    if let Some(guide) = pair.guide.filter(|g| g.weight > 0.0) {
+        let crop = |map: &Image| view.region.crop(map).map_err(error::stage("region"));
+        let (target, confidence) = (crop(&guide.stereo.normals)?, crop(&guide.stereo.confidence)?);
+        let (value, grad) = guided_normal(&maps.normal, &target, &confidence);
+        terms.push(TermValue { name: "guided_normal", weight: guide.weight, value: part(value) });
+        add_scaled(&mut out.shaded.maps.normal, &grad, scale * guide.weight);
+    }
+    let mut push = |term: Term, weight: f32, value: f32| terms.push(TermValue { name: term.name(), weight, value });
     if needs.enhancement {
         let l = diamond_losses::enhancement(&maps.base_color, &target, mask, Average::AllPixels).map_err(&fail)?;
         push(Term::Enhancement, loss.enhancement, part(l.value));

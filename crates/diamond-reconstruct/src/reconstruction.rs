@@ -1,18 +1,20 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
 use crate::exposure;
 use crate::pairs::PairOrder;
+use crate::photometric;
 use crate::random::{Purpose, Random};
 use crate::region::Region;
 use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
 use crate::{
-    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Model, Needs, Neighbour, ReconstructError,
+    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Guide, Model, Needs, Neighbour, ReconstructError,
     Rendering, Scene, StepPlan, StepReport, TrainingPair,
 };
 use diamond_camera::Camera;
 use diamond_consistency::nearest_views;
 use diamond_dataset::{Capture, Observation};
 use diamond_light::OlatLight;
+use diamond_photometric::PhotometricStereo;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -28,6 +30,8 @@ pub struct Reconstruction {
     /// What of each pair's photograph and mask is not empty, once it was looked at.
     contents: Vec<Option<Option<Region>>>,
     order: PairOrder,
+    /// Photometric stereo of each training view, where something asks for it.
+    stereo: Vec<Option<PhotometricStereo>>,
     /// Of each training view the nearest others, where views are compared.
     neighbours: Vec<Vec<usize>>,
     step: u64,
@@ -65,6 +69,25 @@ impl Reconstruction {
         points: &InitialPoints,
         needs: Option<Needs>,
     ) -> Result<Self, ReconstructError> {
+        let facts = CaptureFacts::of(&capture)?;
+        let needs = needs.unwrap_or_else(|| Needs::decide(config, &facts));
+        let guide = &config.photometric;
+        let keeps = guide.supervise > 0.0 && needs.guided_normal.needed || guide.depth && needs.guided_depth.needed;
+        // A resumed run has no points here.
+        let starts = guide.initial && needs.guided_start.needed && !points.positions.is_empty();
+        let mut stereo = match keeps || starts {
+            true => photometric::estimates(&capture, &scene, config)?,
+            false => Vec::new(),
+        };
+        let mut points = points.clone();
+        if starts {
+            let turned = photometric::turn_normals(&mut points, &capture, &stereo, &scene);
+            points.origin += &format!("; {turned} normals by photometric stereo");
+        }
+        if !keeps {
+            stereo = Vec::new();
+        }
+        let points = &points;
         let mut model = Model::initial(config, scene, points)?;
         model.exposure = Exposure::new(config, &capture);
         // A resumed run has no points here, and its light unit in the checkpoint.
@@ -79,8 +102,6 @@ impl Reconstruction {
             });
         }
         let order = PairOrder::new(config.seed, pairs.len());
-        let facts = CaptureFacts::of(&capture)?;
-        let needs = needs.unwrap_or_else(|| Needs::decide(config, &facts));
         let neighbours = match needs.silhouette_consistency.needed || needs.depth_consistency.needed {
             true => {
                 let cameras: Vec<Camera> = capture.train.iter().map(|v| v.camera).collect();
@@ -97,6 +118,7 @@ impl Reconstruction {
             contents: vec![None; pairs.len()],
             pairs,
             order,
+            stereo,
             neighbours,
             step: 0,
             notes: Vec::new(),
@@ -280,6 +302,14 @@ impl Reconstruction {
                     content: loaded.content,
                     view: loaded.view,
                     image: loaded.image,
+                    guide: self.stereo.get(loaded.view).and_then(Option::as_ref).map(|stereo| Guide {
+                        stereo,
+                        weight: match self.needs.guided_normal.needed {
+                            true => self.config.photometric.supervise * plan.photometric,
+                            false => 0.0,
+                        },
+                        depth: self.needs.guided_depth.needed && self.config.photometric.depth,
+                    }),
                     neighbour: loaded
                         .neighbour
                         .map(|(other, seed)| Neighbour { camera: &self.capture.train[other].camera, seed }),

@@ -96,3 +96,62 @@ pub(crate) fn pull_to_nothing(
     }
     Ok(TermValue { name: "residual_pull", weight, value })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Purpose;
+    use crate::{Config, InitialPoints, Scene};
+    use diamond_splat::GaussiansGrad;
+
+    /// [eq:residual-pull] Steps against the gradient bring the term down, by about as much as the gradient says; a step of the
+    /// transfer vectors alone and of the network alone each does.
+    #[test]
+    fn the_gradient_points_away_from_nothing() {
+        let config = Config::preset("resolved").unwrap();
+        let scene = Scene {
+            centre: [0.0; 3],
+            radius: 1.0,
+            extent: 1.0,
+            camera_distance: 3.0,
+            light_distance: 3.0,
+            light_scale: 1.0,
+        };
+        let mut random = Random::new(3, Purpose::Initial, 0);
+        let positions: Vec<Vec3> = (0..40).map(|_| random.direction()).collect();
+        let points = InitialPoints { normals: positions.clone(), positions, ..Default::default() };
+        let mut model = Model::initial(&config, scene, &points).unwrap();
+        let values = model.parameters.values_mut(Attribute::Transfer);
+        values.iter_mut().for_each(|v| *v = 0.1 * random.normal());
+        let look = |model: &Model| {
+            let activated = model.parameters.activate();
+            let mut total = ActivatedGrad { gaussians: GaussiansGrad::zeros(40), ..Default::default() };
+            let mut network = Vec::new();
+            let mut random = Random::new(5, Purpose::ResidualPull, 7);
+            let term = pull_to_nothing(model, &activated, 1, &mut random, &mut total, &mut network).unwrap();
+            (term, total.transfer, network)
+        };
+        let (before, transfer, network) = look(&model);
+        assert!(before.value > 1e-3 && before.weight == config.subsurface.residual_weight);
+        let square = |d: &[f32]| d.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+        // One part moves against its gradient by so little that the term falls as the gradient says.
+        let check = |moved: &Model, slope: f64, rate: f32| {
+            let fallen = f64::from(before.weight * (before.value - look(moved).0.value));
+            let expected = f64::from(rate) * slope;
+            assert!(slope > 0.0 && (fallen / expected - 1.0).abs() < 0.1, "{fallen} {expected}");
+        };
+        let fraction = |slope: f64| (0.02 * f64::from(before.weight * before.value) / slope) as f32;
+        let rate = fraction(square(&transfer));
+        let mut moved = model.clone();
+        moved.parameters.values_mut(Attribute::Transfer).iter_mut().zip(&transfer).for_each(|(v, d)| *v -= rate * d);
+        check(&moved, square(&transfer), rate);
+        let slope = network.iter().map(|d| square(d)).sum::<f64>();
+        let rate = fraction(slope);
+        let mut moved = model.clone();
+        let parts = moved.network.as_mut().map(crate::model::network_parts_mut).unwrap_or_default();
+        for ((_, values), d) in parts.into_iter().zip(&network) {
+            values.iter_mut().zip(d).for_each(|(v, d)| *v -= rate * d);
+        }
+        check(&moved, slope, rate);
+    }
+}

@@ -34,6 +34,8 @@ pub struct StepPlan {
     pub fit_medium: bool,
     /// Factor on the weights of geometric consistency: as many steps as this one stands for, 0 where it stands for none.
     pub consistency: f32,
+    /// Factor on the weight of photometric stereo's normals: from 1 to 0 at `photometric.until`.
+    pub photometric: f32,
 }
 
 /// Geometric interpolation from `a` to `b`; linear where one of them is 0.
@@ -100,6 +102,10 @@ impl StepPlan {
             grow: !frozen,
             prune_large: fraction >= d.large_from,
             fit_medium: m.model.has_medium() && fits.any(|f| at(*f) == step),
+            photometric: match config.photometric.until {
+                until if until > 0.0 => (1.0 - fraction / until).max(0.0),
+                _ => 0.0,
+            },
             consistency: if comparing { c.every_steps as f32 } else { 0.0 },
             reset_opacity: adaptive
                 && reset > 0

@@ -49,6 +49,7 @@ fn train(model: Model, capture: &Capture, gains: &[f32]) -> Model {
             view,
             image,
             neighbour: None,
+            guide: None,
         };
         engine.training_step(step, &StepPlan::new(&config, step), &[pair]).expect("a step");
     }

@@ -85,7 +85,9 @@ fn pictures_are_linear_in_the_light_and_survive_the_files() {
         std::fs::remove_dir_all(&dir).expect("removed");
         let model = run.model().expect("a model");
         let camera = capture().test[0].camera;
-        let OlatLight::Point { position, intensity } = capture().test[0].shots[0].light else { panic!("a point light") };
+        let OlatLight::Point { position, intensity } = capture().test[0].shots[0].light else {
+            panic!("a point light")
+        };
         let of = |factor: f32| OlatLight::Point { position, intensity: intensity * factor };
         let pictures = Renderer::new(model).radiance(&camera, &[of(1.0), of(2.0)]).expect("rendered");
         let again = Renderer::new(&read).radiance(&camera, &[of(1.0)]).expect("rendered");
@@ -108,6 +110,9 @@ fn without_a_medium_nothing_is_fitted_and_without_a_surface_the_run_goes_on() {
     config.subsurface.surface = Some("/no/such/mesh.ply".into());
     let mut run = Reconstruction::new(capture(), &config).expect("starts");
     let notes = finish(&mut run);
-    assert!(notes.len() == 2 && notes[0].contains("no medium was fitted") && notes[0].contains("mesh.ply"), "{notes:?}");
+    assert!(
+        notes.len() == 2 && notes[0].contains("no medium was fitted") && notes[0].contains("mesh.ply"),
+        "{notes:?}"
+    );
     assert!(run.model().expect("a model").medium.is_none() && run.needs().medium.needed);
 }

@@ -75,7 +75,8 @@ pub fn inspect_medium(folder: &Path, changes: Option<&str>, plot: Option<&Path>)
     }
     let path = plot.map_or_else(|| folder.join("medium.svg"), Path::to_owned);
     let spread = term.spread();
-    let of = |c: usize| spread.iter().map(|(r, share)| (f64::from(*r / radius), f64::from(share[c]))).collect::<Vec<_>>();
+    let of =
+        |c: usize| spread.iter().map(|(r, share)| (f64::from(*r / radius), f64::from(share[c]))).collect::<Vec<_>>();
     let svg = curves(
         "Where light leaves that enters at a point",
         "distance, radii of the object",
@@ -95,10 +96,9 @@ fn no_medium(folder: &Path) -> SssError {
 
 /// Puts another medium into a model: one from a TOML file, or the model's own with changes such as `mean_free_path=*2`.
 pub fn edit_medium(model: &mut Model, changes: &str) -> Result<(), SssError> {
-    let term = model
-        .medium
-        .as_ref()
-        .ok_or_else(|| SssError::Usage("this model has no medium that could be changed (subsurface.model = \"mlp\")".into()))?;
+    let term = model.medium.as_ref().ok_or_else(|| {
+        SssError::Usage("this model has no medium that could be changed (subsurface.model = \"mlp\")".into())
+    })?;
     let fail = |e: diamond_medium::MediumError| SssError::from(ReconstructError::Unusable { detail: e.to_string() });
     let medium = match changes.ends_with(".toml") {
         true => Medium::read(Path::new(changes)).map_err(fail)?,

@@ -61,12 +61,12 @@ pub fn surfels(case: &Case, film: &Film, walks: u32) -> Result<Pictures, String>
     Ok(pictures(&channels))
 }
 
-/// Level 2 along some of the camera's rays.
-pub fn rays(case: &Case, film: &Film, walks: u32) -> Result<Pictures, String> {
+/// Level 2 along the camera's rays, of which each pixel has sixteen: a fraction of the walks for each.
+pub fn rays(case: &Case, film: &Film, walks: u32, visibility: u32) -> Result<Pictures, String> {
     let error = |e: diamond_pathtrace::PathtraceError| e.to_string();
     let material = case.scene.material;
     let (starts, pixels) = film.starts();
-    let options = ViewWalkOptions { walks, ..Default::default() };
+    let options = ViewWalkOptions { walks: (walks / 4).max(1), visibility, ..Default::default() };
     let (sigma_t, g) = (material.medium.sigma_t.x, material.medium.g);
     let view = ViewWalks::trace(&case.scene.geometry, sigma_t, g, material.boundary, &starts, &options, &|_| ());
     let moments = view.map_err(error)?.moments(&case.scene.lights).map_err(error)?;
@@ -160,7 +160,7 @@ pub fn bulk(case: &Case, walks: u32) -> Result<Pictures, String> {
     if case.refracts() {
         let mut black = case.scene.clone();
         black.material.medium.albedo = Vec3::ZERO;
-        let surface = render(&black, &BulkOptions { walks: 1, points: 16, ..options })?;
+        let surface = render(&black, &options)?;
         for (picture, surface) in pictures.iter_mut().zip(&surface) {
             picture.iter_mut().zip(surface).for_each(|(p, s)| *p -= s);
         }

@@ -36,6 +36,15 @@ struct Arguments {
     /// Only objects whose name contains this.
     #[arg(long)]
     only: Option<String>,
+    /// Only levels whose name contains this.
+    #[arg(long)]
+    level: Option<String>,
+    /// Only cases whose name (thick or thin, matched or rough) contains this, as in thick-rough.
+    #[arg(long)]
+    case: Option<String>,
+    /// Width of the lamps' maps of view walks in texels; 0 traces every shadow ray.
+    #[arg(long, default_value_t = 256)]
+    visibility: u32,
     /// Mean cosine of the medium.
     #[arg(long, default_value_t = 0.0)]
     g: f32,
@@ -90,6 +99,10 @@ fn table(arguments: &Arguments) -> Result<(), String> {
         }
         for (thickness, sigma_t) in SIGMA_T {
             for (label, boundary) in [("matched", Boundary::IndexMatched), ("rough", ROUGH)] {
+                let wanted = format!("{thickness}-{label}");
+                if arguments.case.as_ref().is_some_and(|o| !wanted.contains(o.as_str())) {
+                    continue;
+                }
                 let case = Case::new(workspace_root(), name, sigma_t, arguments.g, boundary, arguments.surfels)?;
                 let start = seconds();
                 let samples = if case.refracts() { 4 * arguments.samples } else { arguments.samples };
@@ -99,6 +112,9 @@ fn table(arguments: &Arguments) -> Result<(), String> {
                 println!("{name} {thickness} {label}: {} patches, reference {time:.1} s", case.patches.len());
                 let mut shown: Vec<Pictures> = Vec::new();
                 let mut add = |level: &str, make: &dyn Fn() -> Result<Pictures, String>| -> Result<(), String> {
+                    if arguments.level.as_ref().is_some_and(|o| !level.contains(o.as_str())) {
+                        return Ok(());
+                    }
                     let start = seconds();
                     let pictures = make()?;
                     let time = seconds() - start;
@@ -123,7 +139,7 @@ fn table(arguments: &Arguments) -> Result<(), String> {
                 add("profile, fitted", &|| levels::profile(&case, &film, &truth, Profile::Fitted, 12))?;
                 add("walk, matrix", &|| levels::operator(&case, &film, arguments.walks))?;
                 add("walk, surfels", &|| levels::surfels(&case, &film, arguments.walks))?;
-                add("walk, rays", &|| levels::rays(&case, &film, arguments.walks))?;
+                add("walk, rays", &|| levels::rays(&case, &film, arguments.walks, arguments.visibility))?;
                 add("bulk", &|| levels::bulk(&case, 1024))?;
                 let path = arguments.out.join(format!("prior-{name}-{thickness}-{label}.png"));
                 draw(&path, &truth, &shown)?;
@@ -207,8 +223,8 @@ fn sweep(arguments: &Arguments) -> Result<(), String> {
             levels::profile(&case, &film, &truth, Profile::Fitted, n as usize)
         })?;
         curve("matrix: walks", &[16, 64, 256, 1024], &|n| levels::operator(&case, &film, n))?;
-        curve("rays: walks", &[16, 64, 256, 1024], &|n| levels::rays(&case, &film, n))?;
-        curve("bulk: walks", &[64, 256, 1024, 4096], &|n| levels::bulk(&case, n))?;
+        curve("rays: walks", &[16, 64, 256, 1024], &|n| levels::rays(&case, &film, n, arguments.visibility))?;
+        curve("bulk: walks", &[64, 256, 1024], &|n| levels::bulk(&case, n))?;
         curve("reference: paths", &[16, 64, 256], &|n| {
             Ok(case.reference(n, u64::from(n))?.means.iter().map(|m| m.data().to_vec()).collect())
         })?;

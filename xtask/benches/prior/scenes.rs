@@ -172,15 +172,13 @@ pub struct Film {
 }
 
 impl Film {
-    /// Up to four rays of each pixel, with its number and what of it each stands for.
+    /// All rays, with the number of the pixel and what of it each stands for.
     pub fn starts(&self) -> (Vec<WalkStart>, Vec<(usize, f32)>) {
-        let some = |(pixel, rays): (usize, &Vec<FilmRay>)| {
-            let step = rays.len().div_ceil(4).max(1);
-            let chosen: Vec<WalkStart> = rays.iter().skip(step / 2).step_by(step).map(|r| r.start).collect();
-            let share = rays.len() as f32 / (RAYS * RAYS) as f32 / chosen.len().max(1) as f32;
-            chosen.into_iter().map(move |start| (start, (pixel, share)))
+        let share = 1.0 / (RAYS * RAYS) as f32;
+        let each = |(pixel, rays): (usize, &Vec<FilmRay>)| {
+            rays.iter().map(|ray| ray.start).map(|start| (start, (pixel, share))).collect::<Vec<_>>()
         };
-        self.pixels.iter().enumerate().flat_map(some).unzip()
+        self.pixels.iter().enumerate().flat_map(each).unzip()
     }
 
     /// Pictures of `columns` values of each patch (patches × columns): SIDE² × columns, each ray's value times `factor` of its cosine.

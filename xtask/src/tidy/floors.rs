@@ -99,13 +99,21 @@ pub const PACKAGES: &[Package] = &[
     heavy("diamond-dataset", 1, &["glam", "serde", "serde_json", "image", "exr", "sha2", "libm"]),
     light("diamond-consistency", 2, &["glam", "libm"]),
     Package { name: "diamond-losses", floor: 2, outside: Some(&["libm"]), optional: &[], alone: Some(SIMD) },
+    Package {
+        name: "diamond-photometric",
+        floor: 2,
+        outside: Some(&["glam", "libm"]),
+        optional: &["rayon"],
+        alone: Some(&["glam", "libm"]),
+    },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
     heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2", "safetensors", "half"]),
-    heavy("diamond-reconstruct", 3, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
+    heavy("diamond-medium", 3, &["glam", "rayon", "serde", "toml", "libm"]),
+    heavy("diamond-reconstruct", 4, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
     heavy(
         "diamond-sss",
-        5,
+        6,
         &[
             "glam",
             "rayon",
@@ -124,8 +132,8 @@ pub const PACKAGES: &[Package] = &[
             "libm",
         ],
     ),
-    Package { name: "xtask", floor: 6, outside: None, optional: &[], alone: None },
-    Package { name: "diamond-tests", floor: 7, outside: None, optional: &[], alone: None },
+    Package { name: "xtask", floor: 7, outside: None, optional: &[], alone: None },
+    Package { name: "diamond-tests", floor: 8, outside: None, optional: &[], alone: None },
 ];
 
 /// A dependency as a manifest states it.

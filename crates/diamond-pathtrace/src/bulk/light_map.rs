@@ -25,6 +25,9 @@ pub(crate) struct LightMaps<'a> {
     planes: Vec<[f32; 4]>,
     centre: Vec3,
     diameter: f32,
+    /// Ways that cross a surface at a smaller cosine than this are traced: there the triangles of a texel are most often others than the point's.
+    /// 0 traces none for that.
+    pub min_cosine: f32,
 }
 
 /// Ways from one point to all lights. Memory that is kept between points.
@@ -152,7 +155,18 @@ impl<'a> LightMaps<'a> {
                 None => {}
             }
         }
-        Self { geometry, views, side, starts, first, triangles, planes, centre, diameter: 2.0 * radius }
+        Self {
+            geometry,
+            views,
+            side,
+            starts,
+            first,
+            triangles,
+            planes,
+            centre,
+            diameter: 2.0 * radius,
+            min_cosine: 0.0,
+        }
     }
 
     /// How all lights shine on `point`, which lies inside the object, and how much of each way lies inside.
@@ -184,13 +198,14 @@ impl<'a> LightMaps<'a> {
         ways.lengths.clear();
         for l in 0..lights {
             let ([from, to], shine) = (ways.spans[l].map(|i| i as usize), &ways.shines[l]);
-            let (mut length, mut exits) = (0.0, 0);
+            let (mut length, mut exits, mut grazing) = (0.0, 0, false);
             let mut cross = |[nx, ny, nz, offset]: [f32; 4]| {
                 let normal = Vec3::new(nx, ny, nz);
                 let slope = normal.dot(shine.direction);
                 let distance = (offset - normal.dot(p)) / slope;
                 if distance > 0.0 && distance < shine.distance.min(self.diameter) {
                     let sign = if slope > 0.0 { 1 } else { -1 };
+                    grazing |= slope.abs() < self.min_cosine;
                     exits += sign;
                     length += sign as f32 * distance;
                 }
@@ -200,7 +215,7 @@ impl<'a> LightMaps<'a> {
                 let list = &self.triangles[self.first[l]..][from + 1..to];
                 list.iter().for_each(|triangle| cross(self.planes[*triangle as usize]));
             }
-            ways.lengths.push(match exits == 1 && length > 0.0 {
+            ways.lengths.push(match exits == 1 && length > 0.0 && !grazing {
                 true => length,
                 false => self.geometry.inside_length(point, shine.direction, shine.distance, true, NO_PRIMITIVE),
             });

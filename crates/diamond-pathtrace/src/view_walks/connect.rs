@@ -1,14 +1,20 @@
 //! Walks that were recorded, under lamps.
-use super::record::{enclosing, has_wide_lobe, kept};
+use super::entering_kernel::{EnteringKernel, MIN_INNER_COSINE};
+use super::record::{enclosing, kept};
 use super::{RadianceMoments, ViewWalks};
+use crate::bulk::directions::carried;
 use crate::bulk::lamps::Lamps;
 use crate::bulk::light_map::{LightMaps, Ways};
-use crate::bulk::points::SurfacePoints;
-use crate::bulk::refracting::entering;
+use crate::bulk::points::SurfacePoint;
+use crate::bulk::refracting::Cone;
 use crate::geometry::Facing;
 use crate::medium::henyey_greenstein;
 use crate::{Frame, Light, PathtraceError};
+use glam::Vec3;
 use rayon::prelude::*;
+
+/// Towards outlines, as lamps see them, light maps are not precise enough: a lamp from behind would be short of 3 %.
+const MIN_COSINE: f32 = 0.35;
 
 impl ViewWalks<'_> {
     /// What every start gets from every lamp through walks of each bin of scatterings, for lamps of colour 1: what a fit of the albedo
@@ -25,17 +31,16 @@ impl ViewWalks<'_> {
         if !values.is_empty() {
             match &self.entrances {
                 None => self.connect_scatterings(&lamps, &mut values, width),
-                Some((cone, points)) => match has_wide_lobe(self.boundary) {
-                    true => self.connect_lobes(&lamps, points, cone.eta2, &mut values, width),
-                    false => self.connect_entrances(&lamps, &mut values, width),
-                },
+                Some(_) => self.connect_entrances(&lamps, &mut values, width),
             }
         }
         Ok(RadianceMoments { exponents: self.bins.exponents.clone(), values })
     }
 
     fn connect_scatterings(&self, lamps: &Lamps, values: &mut [f32], width: usize) {
-        let maps = LightMaps::new(self.geometry, lamps, self.options.visibility);
+        let mut maps = LightMaps::new(self.geometry, lamps, self.options.visibility);
+        maps.min_cosine = MIN_COSINE;
+        let maps = &maps;
         let (low, size) = enclosing(self.geometry);
         let bins = self.bins.ends.len();
         let scale = 1.0 / self.options.walks as f32;
@@ -59,56 +64,64 @@ impl ViewWalks<'_> {
         });
     }
 
-    /// Through the lobe of a rough boundary.
-    fn connect_lobes(&self, lamps: &Lamps, points: &SurfacePoints, eta2: f32, values: &mut [f32], width: usize) {
-        let lights = lamps.len();
-        // Direction to each lamp and what it sends, at each entrance.
-        let shines: Vec<_> = points
+    fn connect_entrances(&self, lamps: &Lamps, values: &mut [f32], width: usize) {
+        let Some((cone, points)) = &self.entrances else { return };
+        let (lights, kernel) = (lamps.len(), EnteringKernel::new());
+        let kernel = &kernel;
+        let rays: Vec<InnerRay> = points
             .points()
             .par_iter()
-            .flat_map_iter(|point| {
-                (0..lights).map(move |l| {
-                    let shine = lamps.shine(l, point.position);
-                    let (to, far, skip) = (shine.direction, shine.distance, point.primitive);
-                    let dark = to.dot(point.normal) <= 0.0
-                        || self.geometry.occluded(point.position, to, far, Facing::Entering, skip);
-                    (to, if dark { 0.0 } else { shine.factor })
-                })
-            })
+            .flat_map_iter(|point| (0..lights).map(move |l| self.inner_ray(lamps, l, point, cone, kernel)))
             .collect();
         let bins = self.bins.ends.len();
-        let scale = 1.0 / (self.options.walks as f32 * eta2);
+        // Radiance is smaller outside by the squared index.
+        let scale = 1.0 / (self.options.walks as f32 * cone.eta2);
         values.par_chunks_exact_mut(width).enumerate().with_min_len(4).for_each(|(k, h)| {
             for connection in &self.connections[self.starts[k]..self.starts[k + 1]] {
-                let normal = points.points()[connection.entrance()].smooth_normal;
-                let back = -Frame::new(normal).to_world(connection.direction());
+                let direction = connection.direction();
+                if direction.z < MIN_INNER_COSINE {
+                    continue;
+                }
+                let weight = scale / direction.z;
                 let bin = self.bins.of[usize::from(connection.scatterings)] as usize;
-                let row = &shines[connection.entrance() * lights..][..lights];
-                for ((to, factor), h) in row.iter().zip(h[bin..].iter_mut().step_by(bins)) {
-                    if *factor > 0.0 && to.dot(normal) > 0.0 {
-                        *h += scale * factor * self.boundary.evaluate(back, *to, normal).0;
+                let row = &rays[connection.entrance() * lights..][..lights];
+                for (ray, h) in row.iter().zip(h[bin..].iter_mut().step_by(bins)) {
+                    if ray.power > 0.0 {
+                        *h += weight * ray.power * kernel.at(&ray.kernel, ray.direction.dot(direction), direction.z);
                     }
                 }
             }
         });
     }
 
-    fn connect_entrances(&self, lamps: &Lamps, values: &mut [f32], width: usize) {
-        let Some((cone, points)) = &self.entrances else { return };
-        let entering = entering(self.geometry, lamps, points, cone);
-        let (bins, lights) = (self.bins.ends.len(), lamps.len());
-        // Radiance is smaller outside by the squared index.
-        let scale = 1.0 / (self.options.walks as f32 * cone.eta2);
-        values.par_chunks_exact_mut(width).enumerate().with_min_len(4).for_each(|(k, h)| {
-            for connection in &self.connections[self.starts[k]..self.starts[k + 1]] {
-                let kernel = cone.kernel(connection.direction());
-                let rows = &entering[connection.entrance() * kernel.len() * lights..][..kernel.len() * lights];
-                let bin = self.bins.of[usize::from(connection.scatterings)] as usize;
-                for (l, h) in h[bin..].iter_mut().step_by(bins).enumerate() {
-                    let value: f32 = kernel.iter().enumerate().map(|(b, g)| g * rows[b * lights + l]).sum();
-                    *h += scale * value;
-                }
-            }
-        });
+    /// A lamp's light just under the surface.
+    fn inner_ray(
+        &self,
+        lamps: &Lamps,
+        lamp: usize,
+        point: &SurfacePoint,
+        cone: &Cone,
+        kernel: &EnteringKernel,
+    ) -> InnerRay {
+        let shine = lamps.shine(lamp, point.position);
+        let cos = shine.direction.dot(point.normal);
+        let (far, skip) = (shine.distance, point.primitive);
+        if cos <= 0.0 || self.geometry.occluded(point.position, shine.direction, far, Facing::Entering, skip) {
+            return InnerRay { direction: Vec3::Z, power: 0.0, kernel: [0.0; 3] };
+        }
+        let (passed, sum) = cone.pass(shine.direction, point.normal);
+        let local = carried(sum, point.normal, Frame::new(point.smooth_normal));
+        let direction = local.normalize_or(Vec3::Z);
+        InnerRay { direction, power: shine.factor * cos * passed, kernel: kernel.around(direction.z) }
     }
+}
+
+/// Light that has entered.
+struct InnerRay {
+    /// Mean direction from which it comes, turned back: outward, in the entrance's frame.
+    direction: Vec3,
+    /// Power per area.
+    power: f32,
+    /// See [`EnteringKernel::around`].
+    kernel: [f32; 3],
 }

@@ -1,8 +1,8 @@
 //! Walks that remember where lamps could be connected with them.
+use super::entering_kernel::MIN_INNER_COSINE;
 use super::{ViewWalkOptions, WalkStart};
 use crate::bulk::directions::carried;
 use crate::bulk::points::SurfacePoints;
-use crate::bulk::refracting::Cone;
 use crate::exit_walks::walker::{Passage, pass};
 use crate::geometry::{Facing, NO_PRIMITIVE};
 use crate::medium::sample_henyey_greenstein;
@@ -13,14 +13,6 @@ use glam::{Vec2, Vec2Swizzles, Vec3};
 
 /// Surfaces met in air between two stretches inside, at most: beyond are meshes that are none.
 const MAX_BOUNCES: u32 = 64;
-
-/// Rough boundaries from this width of their lobe on send light of a lamp in enough directions for walks to meet it.
-const WIDE_LOBE: f32 = 0.2;
-
-/// Whether lamps are connected with walks through the lobe of the boundary itself.
-pub(crate) fn has_wide_lobe(boundary: Boundary) -> bool {
-    matches!(boundary.effective(), Boundary::Rough { alpha, .. } if alpha >= WIDE_LOBE)
-}
 
 /// Where a lamp's light can join a walk.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -102,11 +94,10 @@ pub(crate) struct Recorder<'a> {
     g: f32,
     boundary: Boundary,
     options: ViewWalkOptions,
-    entrances: Option<(&'a Cone, &'a SurfacePoints)>,
+    entrances: Option<&'a SurfacePoints>,
     low: Vec3,
     high: Vec3,
     size: Vec3,
-    wide: bool,
 }
 
 /// A walk inside the object.
@@ -124,13 +115,11 @@ impl<'a> Recorder<'a> {
         g: f32,
         boundary: Boundary,
         options: ViewWalkOptions,
-        entrances: Option<&'a (Box<Cone>, SurfacePoints)>,
+        entrances: Option<&'a SurfacePoints>,
     ) -> Self {
         let (low, high) = geometry.bounds();
         let (_, size) = enclosing(geometry);
-        let entrances = entrances.map(|(cone, points)| (&**cone, points));
-        let (boundary, wide) = (boundary.effective(), has_wide_lobe(boundary));
-        Self { geometry, sigma_t, g, boundary, options, entrances, low, high, size, wide }
+        Self { geometry, sigma_t, g, boundary: boundary.effective(), options, entrances, low, high, size }
     }
 
     /// All walks of a start, and how many were cut off; `stream` numbers its random numbers.
@@ -194,9 +183,9 @@ impl<'a> Recorder<'a> {
     /// The walk meets the surface from inside; whether it is inside again afterwards.
     #[inline]
     fn surface(&self, p: &mut State, mut hit: Hit, rng: &mut Rng, connections: &mut Vec<Connection>) -> bool {
-        if let Some((cone, points)) = self.entrances
+        if let Some(points) = self.entrances
             && p.scatterings > 0
-            && (self.wide || cone.holds(p.direction, hit.normal))
+            && p.direction.dot(hit.normal) > MIN_INNER_COSINE
         {
             let entrance = points.nearest(hit.position, hit.normal);
             let frame = Frame::new(points.points()[entrance as usize].smooth_normal);

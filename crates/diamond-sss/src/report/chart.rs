@@ -110,7 +110,11 @@ pub fn curves(title: &str, across: &str, up: &str, curves: &[(&str, &str, Vec<(f
         let _ = write!(
             out,
             "<line x1=\"64\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\" stroke=\"#ddd\"/><text x=\"58\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
-            W - 20.0, y(v), y(v), y(v) + 4.0, label(v)
+            W - 20.0,
+            y(v),
+            y(v),
+            y(v) + 4.0,
+            label(v)
         );
         v += step;
     }
@@ -118,14 +122,21 @@ pub fn curves(title: &str, across: &str, up: &str, curves: &[(&str, &str, Vec<(f
         for lead in [1.0, 2.0, 5.0] {
             let v = lead * 10f64.powi(power);
             if v >= left && v <= right {
-                let _ = write!(out, "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>", x(v), H - 34.0, label(v));
+                let _ = write!(
+                    out,
+                    "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>",
+                    x(v),
+                    H - 34.0,
+                    label(v)
+                );
             }
         }
     }
     let _ = write!(
         out,
         "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{across}</text><text x=\"64\" y=\"38\" fill=\"#555\">{up}</text>",
-        0.5 * W, H - 12.0
+        0.5 * W,
+        H - 12.0
     );
     for (k, (name, colour, points)) in curves.iter().enumerate() {
         let usable = points.iter().filter(|p| p.0 > 0.0 && p.0.is_finite() && p.1.is_finite());

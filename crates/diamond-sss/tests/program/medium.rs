@@ -34,7 +34,9 @@ fn a_medium_is_shown_edited_and_rendered() {
     assert_eq!(render("same.png", &["--medium", text(&file)]), plain);
 
     let picture = dir.join("never.png");
-    for (medium, word) in [("albedo=0.5", "reflectance"), ("nothing", "KEY=VALUE"), ("missing.toml", "could not be read")] {
+    for (medium, word) in
+        [("albedo=0.5", "reflectance"), ("nothing", "KEY=VALUE"), ("missing.toml", "could not be read")]
+    {
         let failed = diamond(&["render", text(&out), "-o", text(&picture), "--medium", medium]);
         assert!(!failed.status.success() && stderr(&failed).contains(word), "{medium}: {}", stderr(&failed));
     }
