@@ -22,7 +22,7 @@ pub struct Exitance {
 #[derive(Debug)]
 enum Form {
     Profile { profile: RadialProfile, transport: Box<SurfelTransport> },
-    Walk { operators: [WalkOperator; 3], gain: Vec3 },
+    Walk { operators: Box<[WalkOperator; 3]>, gain: Vec3 },
 }
 
 impl Exitance {
@@ -51,7 +51,7 @@ impl Exitance {
                     let found = walks.iter().find(|w| w.0 == sigma_t[c]).map(|w| w.1.collapse(albedo[c]));
                     found.unwrap_or_else(|| trace(sigma_t[c])?.collapse(albedo[c]))
                 };
-                Form::Walk { operators: [of(0)?, of(1)?, of(2)?], gain: Vec3::from(*gain) }
+                Form::Walk { operators: Box::new([of(0)?, of(1)?, of(2)?]), gain: Vec3::from(*gain) }
             }
         };
         Ok(Self { form })

@@ -311,33 +311,37 @@ impl<'a> Evidence<'a> {
         let encode = |v: f32| Transfer::Srgb.encode(v.clamp(0.0, 1.0));
         let (mut squares, mut truth, mut count) = (0.0f64, 0.0f64, 0u64);
         // Differences of a pixel under all lights of its view, where there are several.
-        let mut views: BTreeMap<*const Camera, BTreeMap<usize, ([f64; 3], f64, u32)>> = BTreeMap::new();
+        let mut views: Vec<(&Camera, BTreeMap<usize, Left>)> = Vec::new();
         for rows in &self.rows {
-            let view = views.entry(std::ptr::from_ref(rows.image.camera)).or_default();
+            let place = views.iter().position(|v| std::ptr::eq(v.0, rows.image.camera)).unwrap_or_else(|| {
+                views.push((rows.image.camera, BTreeMap::new()));
+                views.len() - 1
+            });
+            let view = &mut views[place].1;
             for n in 0..rows.pixels.len() {
-                let entry = view.entry(rows.pixels[n]).or_insert(([0.0; 3], 0.0, 0));
-                entry.2 += 1;
+                let left = view.entry(rows.pixels[n]).or_default();
+                left.lights += 1;
                 for c in 0..3 {
                     let (_, known, b) = Self::pixel(rows, n, c);
                     let d = f64::from(encode(known + self.predicted(rows, x, n, c)) - encode(b));
                     squares += d * d;
                     truth += f64::from(encode(b)).powi(2);
                     count += 1;
-                    entry.0[c] += d;
-                    entry.1 += d * d;
+                    left.sum[c] += d;
+                    left.squares += d * d;
                 }
             }
         }
         let (mut same, mut all) = (0.0f64, 0.0f64);
-        for (sum, square, n) in views.values().flat_map(BTreeMap::values).filter(|v| v.2 > 1) {
-            same += sum.iter().map(|s| s * s).sum::<f64>() / f64::from(*n);
-            all += square;
+        for left in views.iter().flat_map(|v| v.1.values()).filter(|l| l.lights > 1) {
+            same += left.sum.iter().map(|s| s * s).sum::<f64>() / f64::from(left.lights);
+            all += left.squares;
         }
         let mean = squares / count.max(1) as f64;
         Quality {
             images: self.rows.len(),
             relative_error: (squares / truth.max(1e-12)).sqrt() as f32,
-            psnr: (-10.0 * mean.max(1e-12).log10()) as f32,
+            psnr: (-10.0 * libm::log10(mean.max(1e-12))) as f32,
             constant_part: if all > 0.0 { (same / all) as f32 } else { 0.0 },
         }
     }
@@ -352,6 +356,14 @@ impl<'a> Evidence<'a> {
         let roughness = scales.iter().zip(COATS).map(|(s, r)| s * f64::from(r)).sum::<f64>() / sum;
         Coat { roughness: roughness as f32, scale: sum as f32 }
     }
+}
+
+/// What is left of a pixel's value under the lights of its view.
+#[derive(Default)]
+struct Left {
+    sum: [f64; 3],
+    squares: f64,
+    lights: u32,
 }
 
 /// Slope of the sRGB curve between two values.

@@ -104,6 +104,7 @@ fn setting(camera: &Camera, light: &OlatLight, config: &ShadingConfig) -> Settin
             diffuse: match config.brdf.diffuse {
                 Diffuse::Lambert => ggx::Diffuse::Lambert,
                 Diffuse::FresnelWeighted => ggx::Diffuse::FresnelWeighted,
+                Diffuse::Omitted => ggx::Diffuse::Omitted,
             },
         },
         incident: match config.incident {

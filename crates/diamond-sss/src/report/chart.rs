@@ -87,8 +87,11 @@ pub fn chart(title: &str, unit: &str, points: &[(f64, f64)], from_zero: bool) ->
     out
 }
 
-/// A file with several curves over a logarithmic axis from above 0, with a legend: (name, colour, points).
-pub fn curves(title: &str, across: &str, up: &str, curves: &[(&str, &str, Vec<(f64, f64)>)]) -> String {
+/// A curve of several: name, colour, points.
+pub type Curve<'a> = (&'a str, &'a str, Vec<(f64, f64)>);
+
+/// A file with several curves over a logarithmic axis from above 0, with a legend.
+pub fn curves(title: &str, across: &str, up: &str, curves: &[Curve<'_>]) -> String {
     const W: f64 = 640.0;
     const H: f64 = 360.0;
     let all = || curves.iter().flat_map(|c| &c.2).filter(|p| p.0 > 0.0 && p.0.is_finite() && p.1.is_finite());
