@@ -245,7 +245,7 @@ impl Medium {
     }
 
     /// With changes: `KEY = VALUE` with commas between. Keys: `mean_free_path` (all distances; profile and walks), `reflectance` (profile), `sigma_t`, `albedo`, `g`, `gain`
-    /// (walks), `roughness` and `coat` (its scale). A value is one number for all channels or three; `*2` multiplies what is there.
+    /// (walks). The coat is not edited here: in a model it belongs to the Gaussians' materials. A value is one number for all channels or three; `*2` multiplies what is there.
     pub fn edited(&self, changes: &str) -> Result<Self, MediumError> {
         let mut out = self.clone();
         for change in changes.split(',').map(str::trim).filter(|c| !c.is_empty()) {
@@ -274,8 +274,6 @@ impl Medium {
         let set = |now: Vec3| if factor { now * value } else { value };
         let reflectance = self.reflectance();
         match (key, &mut self.transport) {
-            ("roughness", _) => self.coat.roughness = set(Vec3::splat(self.coat.roughness)).x,
-            ("coat", _) => self.coat.scale = set(Vec3::splat(self.coat.scale)).x,
             ("mean_free_path", Transport::Profile { widths, .. }) => {
                 if !factor || value.x != value.y || value.y != value.z {
                     return Err(fail(format!(
@@ -297,13 +295,11 @@ impl Medium {
             ("gain", Transport::Walk { gain, .. }) => *gain = set(Vec3::from(*gain)).to_array(),
             ("g", Transport::Walk { g, .. }) => *g = set(Vec3::splat(*g)).x,
             (_, Transport::Profile { .. }) => {
-                return Err(fail(format!(
-                    "`{key}`: a profile has `mean_free_path`, `reflectance`, `roughness` and `coat`"
-                )));
+                return Err(fail(format!("`{key}`: a profile has `mean_free_path` and `reflectance`")));
             }
             (_, Transport::Walk { .. }) => {
                 return Err(fail(format!(
-                    "`{key}`: a medium of walks has `sigma_t`, `albedo`, `g`, `gain`, `mean_free_path`, `roughness` and `coat`"
+                    "`{key}`: a medium of walks has `sigma_t`, `albedo`, `g`, `gain` and `mean_free_path`"
                 )));
             }
         }
@@ -335,7 +331,7 @@ mod tests {
     fn files_round_trip_and_edits_say_what_is_wrong() {
         let medium = walk();
         assert_eq!(Medium::parse(&medium.to_toml().unwrap()).unwrap(), medium);
-        let edited = medium.edited("mean_free_path=*2, albedo=0.5 0.6 0.7,roughness=0.5").unwrap();
+        let edited = medium.edited("mean_free_path=*2, albedo=0.5 0.6 0.7").unwrap();
         assert_eq!(
             edited.transport,
             Transport::Walk { sigma_t: [5.0, 10.0, 15.0], albedo: [0.5, 0.6, 0.7], g: 0.0, ior: 1.3, gain: [1.0; 3] }
@@ -349,6 +345,7 @@ mod tests {
             ("reflectance=1", "sigma_t"),
             ("sigma_t=-1", "numbers > 0"),
             ("sigma_t=NaN", "numbers > 0"),
+            ("coat=0", "sigma_t"),
         ] {
             let text = medium.edited(bad).unwrap_err().to_string();
             assert!(text.contains(word), "{bad}: {text}");

@@ -54,6 +54,10 @@ pub(crate) fn network_config(config: &Config) -> ResidualNetworkConfig {
         if config.residual.leak > 0.0 { Activation::LeakyRelu(config.residual.leak) } else { Activation::Relu };
     out.code_size = config.residual.codes;
     out.incident_bias = config.residual.incident_bias;
+    if config.subsurface.model.has_medium() {
+        // What is added to a medium may be less than nothing, and begins at nothing: a sigmoid would begin at ½.
+        out.residual_output = Activation::Linear;
+    }
     if config.shading.incident != crate::IncidentVariant::Learned {
         out.incident_head = None;
     }

@@ -84,8 +84,8 @@ diamond inspect bunny.spz -o bunny.png")]
   diamond inspect-medium out --medium \"mean_free_path=*2\" -o softer.svg
 
 The medium is DIR/medium.toml, for people to read and change: diamond render DIR --medium changed.toml.
-Keys of --medium: mean_free_path (all distances), reflectance (a profile), sigma_t, albedo, g, gain (walks),
-roughness, coat. One number or three (red green blue); *2 multiplies what is there.")]
+Keys of --medium: mean_free_path (all distances), reflectance (a profile), sigma_t, albedo, g, gain (walks).
+One number or three (red green blue); *2 multiplies what is there.")]
     InspectMedium {
         /// Folder of a finished reconstruction
         dir: PathBuf,

@@ -21,7 +21,7 @@ fn a_medium_is_shown_edited_and_rendered() {
 
     let render = |name: &str, medium: &[&str]| {
         let path = dir.join(name);
-        let fixed = ["render", text(&out), "-o", text(&path), "--direction", "0,0,1"];
+        let fixed = ["render", text(&out), "-o", text(&path), "--direction", "0,0,1", "--exposure", "-3"];
         succeed(&[&fixed, medium].concat());
         let picture = image::open(&path).unwrap().to_rgb8();
         picture.as_raw().iter().map(|v| u64::from(*v)).sum::<u64>()
