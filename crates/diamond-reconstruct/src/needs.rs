@@ -202,6 +202,7 @@ impl Needs {
             (true, ..) => "the visibility channel is rasterised",
             (_, true, _) => "the residual network reads it",
             (_, _, true) => "the SH fit is compared with it",
+            _ if config.subsurface.model.has_medium() => "what leaves the medium where it enters reads it",
             _ => "",
         };
         let visibility = match read {

@@ -106,6 +106,12 @@ fn without_a_medium_nothing_is_fitted_and_without_a_surface_the_run_goes_on() {
     assert!(finish(&mut run).is_empty() && run.model().expect("a model").medium.is_none());
     assert!(!run.needs().medium.needed && !run.needs().residual_pull.needed);
 
+    // A medium alone reads the visibility of lights even where nothing else does.
+    let mut alone = config(SubsurfaceModel::Profile);
+    (alone.shading.surface_visibility, alone.loss.visibility) = (false, 0.0);
+    let run = Reconstruction::new(capture(), &alone).expect("starts");
+    assert!(run.needs().traced_visibility.needed, "{}", run.needs().traced_visibility.reason);
+
     let mut config = config(SubsurfaceModel::ProfileMlp);
     config.subsurface.surface = Some("/no/such/mesh.ply".into());
     let mut run = Reconstruction::new(capture(), &config).expect("starts");
