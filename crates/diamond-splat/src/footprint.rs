@@ -6,7 +6,7 @@ use glam::{Vec3, Vec4};
 
 /// How far beyond the image, as a fraction of the half field of view, the linearisation point may lie. Farther out the
 /// tangent x/z is clamped, because the linear map there would smear a Gaussian over the whole image.
-const JACOBIAN_MARGIN: f64 = 0.3;
+pub const JACOBIAN_MARGIN: f64 = 0.3;
 /// Quaternions of smaller squared norm count as the identity, with zero gradient: their direction is rounding noise.
 const MIN_QUATERNION_NORM2: f64 = 1e-24;
 /// A camera in f64, with the limits of the linearisation point.

@@ -30,6 +30,7 @@ pub use blend_weights::{BlendBlock, BlendWeights, BlockBlender, KeepAll};
 pub use config::{Cutoff, RasterConfig};
 pub use error::SplatError;
 pub use factor::LowerFactor;
+pub use footprint::JACOBIAN_MARGIN;
 pub use gaussians::{Features, Gaussians, GaussiansGrad, RasterPull};
 pub use hull::{Hull, HullConfig, scene_bounds_from_masks, visual_hull};
 pub use light_grid::LightGrid;
@@ -38,7 +39,7 @@ pub use ply::{
     Keep, PlyColumn, PlyElementLayout, PlyFormat, PlyLayout, PlyPropertyLayout, PlyTable, PointCloud, SH_DC,
     ScalarType, SplatPly, parse_ply, parse_ply_columns, ply_bytes, ply_layout, read_ply, replace_file, write_ply,
 };
-pub use projection::{Footprint, Projection, project};
+pub use projection::{Ellipse64, Footprint, Projection, project};
 pub use rasterize::{Raster, RasterGrad, RasterPullback, RasterStats, rasterize, rasterize_projected};
 pub use recycle::{KEPT_BYTES, keep_buffers};
 pub use visibility::{GaussianBvh, MAX_OCCLUDER_ALPHA, MIN_OCCLUDER_ALPHA, VisibilityConfig};

@@ -36,6 +36,21 @@ pub struct Footprint {
     pub extent: Vec2,
 }
 
+/// The screen-space picture of one Gaussian in the precision that it is blended with, for engines that blend elsewhere.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ellipse64 {
+    /// Projected mean, pixels (pixel centres at +0.5).
+    pub mean: [f64; 2],
+    /// Lower Cholesky factor `l11, l21, l22` of the inverse screen covariance, 1/px.
+    pub chol: [f64; 3],
+    /// Opacity.
+    pub opacity: f32,
+    /// View-space z of the mean, scene units.
+    pub depth: f32,
+    /// Half the width and height of the box outside which alpha is below the threshold, pixels.
+    pub extent: [f32; 2],
+}
+
 /// One Gaussian that can contribute, with what the kernels need: a cache line.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Splat {
@@ -107,11 +122,21 @@ impl Projection {
         &self.config
     }
 
-    /// The footprint of a Gaussian, `None` where it is culled.
-    pub fn footprint(&self, gaussian: usize) -> Option<Footprint> {
+    fn splat(&self, gaussian: usize) -> Option<&Splat> {
         let k = self.visible.binary_search(&u32::try_from(gaussian).ok()?).ok()?;
         let run = self.bins.ranges.partition_point(|range| range.end <= k);
-        let s = &self.bins.runs[run].splats[k - self.bins.ranges[run].start];
+        Some(&self.bins.runs[run].splats[k - self.bins.ranges[run].start])
+    }
+
+    /// The ellipse of a Gaussian as it is blended, `None` where it is culled.
+    pub fn ellipse(&self, gaussian: usize) -> Option<Ellipse64> {
+        let Splat { mean, chol, opacity, depth, extent, .. } = *self.splat(gaussian)?;
+        Some(Ellipse64 { mean, chol, opacity, depth, extent })
+    }
+
+    /// The footprint of a Gaussian, `None` where it is culled.
+    pub fn footprint(&self, gaussian: usize) -> Option<Footprint> {
+        let s = self.splat(gaussian)?;
         let [l11, l21, l22] = s.chol;
         Some(Footprint {
             mean: Vec2::new(s.mean[0] as f32, s.mean[1] as f32),

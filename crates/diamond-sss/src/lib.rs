@@ -16,6 +16,7 @@
 mod camera_path;
 mod capture_check;
 mod contact_sheet;
+mod devices;
 mod error;
 mod evaluation;
 mod export;
@@ -40,6 +41,7 @@ mod training_log;
 pub use camera_path::{CameraChoice, cameras_of, parse_cameras, read_cameras};
 pub use capture_check::open_capture;
 pub use contact_sheet::{SheetOptions, contact_sheet, family_sheet};
+pub use devices::devices_text;
 pub use error::SssError;
 pub use evaluation::{FittedGain, HeldOutGain, ImageScore, PSNR_CAP, Scored, evaluate_model};
 pub use export::{ExportOptions, Exported, convert_splats, export_model, is_splat_file, parse_turn};

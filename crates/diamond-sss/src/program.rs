@@ -113,6 +113,10 @@ fn run(command: Command) -> Result<(), SssError> {
             report_export(&output, &exported);
             Ok(())
         }
+        Command::Devices => {
+            print(&diamond_sss::devices_text());
+            Ok(())
+        }
         Command::Presets { name } => {
             match name {
                 Some(name) => print(&Config::load(&name)?.to_toml()?),

@@ -32,7 +32,7 @@ impl Package {
 }
 
 /// Outside crates that any package may use in tests and benches.
-const FOR_TESTS: &[&str] = &["proptest", "divan"];
+const FOR_TESTS: &[&str] = &["proptest", "divan", "libtest-mimic"];
 
 /// The testkit's name: the one package of ours that any other may use, in tests only.
 const TESTKIT: &str = "diamond-testkit";
@@ -111,6 +111,7 @@ pub const PACKAGES: &[Package] = &[
     heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2", "safetensors", "half"]),
     heavy("diamond-medium", 3, &["glam", "rayon", "serde", "toml", "libm"]),
     heavy("diamond-reconstruct", 4, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
+    heavy("diamond-gpu", 5, &["glam", "wgpu", "naga", "bytemuck", "pollster", "libm", "rand_pcg"]),
     heavy(
         "diamond-sss",
         6,

@@ -174,6 +174,9 @@ Shards that are there are kept, so the same command goes on after an interruptio
         #[arg(long, value_name = "SIZE", default_value = "64MiB")]
         shard_size: ByteSize,
     },
+    /// List what this machine has to compute on
+    #[command(after_help = "Example:\n  diamond devices")]
+    Devices,
     /// List the presets, or print one as TOML to start a configuration from
     #[command(after_help = "Examples:\n  diamond presets\n  diamond presets resolved > mine.toml")]
     Presets {

@@ -35,6 +35,13 @@ fn succeed(arguments: &[&str]) -> Output {
 }
 
 #[test]
+fn devices_are_listed_with_the_cpu_first() {
+    let output = succeed(&["devices"]);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(text.starts_with("cpu ") && (text.contains("gpu:0") || text.contains("no GPU")), "{text}");
+}
+
+#[test]
 fn from_capture_to_report_and_pictures() {
     let dir = scratch("end-to-end");
     let (capture, out, config) = (dir.join("capture"), dir.join("out"), small_config(&dir));

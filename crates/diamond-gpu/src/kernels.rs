@@ -1,0 +1,224 @@
+//! The sources of the kernels and their compiled pipelines.
+use crate::device::STORAGE_BINDINGS;
+use crate::{Device, GpuError};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Files of WGSL by name.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sources(BTreeMap<&'static str, String>);
+
+macro_rules! sources {
+    ($($name:literal),* $(,)?) => {
+        [$(($name, include_str!(concat!("../wgsl/", $name)))),*]
+    };
+}
+
+impl Default for Sources {
+    fn default() -> Self {
+        let files = sources![
+            "frame.wgsl",
+            "pair.wgsl",
+            "linearised.wgsl",
+            "tile_span.wgsl",
+            "alpha.wgsl",
+            "projection.wgsl",
+            "scan.wgsl",
+            "sort.wgsl",
+            "tile_offsets.wgsl",
+            "tile_entries.wgsl",
+            "tile_ranges.wgsl",
+            "blend.wgsl",
+            "blend_pull.wgsl",
+            "splat_sum.wgsl",
+            "projection_pull.wgsl",
+        ];
+        Self(files.into_iter().map(|(name, text)| (name, text.to_string())).collect())
+    }
+}
+
+impl Sources {
+    /// The sources with the only occurrence of `from` in a file replaced: how tests plant an error. `None` if there is
+    /// no such file, or `from` does not occur in it exactly once.
+    pub fn with_edit(mut self, file: &str, from: &str, to: &str) -> Option<Self> {
+        let text = self.0.get_mut(file)?;
+        if text.matches(from).count() != 1 {
+            return None;
+        }
+        *text = text.replace(from, to);
+        Some(self)
+    }
+
+    /// What a module is compiled from.
+    pub fn of(&self, module: Module) -> String {
+        let text = |name: &&str| self.0.get(*name).map_or("", String::as_str);
+        module.files().iter().map(text).collect::<Vec<_>>().join("\n")
+    }
+}
+
+/// A unit that is compiled: a file after those that it uses, and what its arrays are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Module {
+    /// `projection.wgsl`
+    Projection,
+    /// `scan.wgsl`
+    Scan,
+    /// `sort.wgsl`
+    Sort,
+    /// `tile_offsets.wgsl`
+    TileOffsets,
+    /// `tile_entries.wgsl`
+    TileEntries,
+    /// `tile_ranges.wgsl`
+    TileRanges,
+    /// `blend.wgsl`
+    Blend,
+    /// `blend_pull.wgsl`
+    BlendPull,
+    /// `splat_sum.wgsl`
+    SplatSum,
+    /// `projection_pull.wgsl`
+    ProjectionPull,
+}
+
+impl Module {
+    /// All of them.
+    pub const ALL: [Module; 10] = [
+        Module::Projection,
+        Module::Scan,
+        Module::Sort,
+        Module::TileOffsets,
+        Module::TileEntries,
+        Module::TileRanges,
+        Module::Blend,
+        Module::BlendPull,
+        Module::SplatSum,
+        Module::ProjectionPull,
+    ];
+
+    /// The files that it is compiled from, in this order.
+    pub fn files(self) -> &'static [&'static str] {
+        match self {
+            Module::Projection => &["frame.wgsl", "pair.wgsl", "linearised.wgsl", "tile_span.wgsl", "projection.wgsl"],
+            Module::Scan => &["frame.wgsl", "scan.wgsl"],
+            Module::Sort => &["frame.wgsl", "sort.wgsl"],
+            Module::TileOffsets => &["frame.wgsl", "tile_offsets.wgsl"],
+            Module::TileEntries => &["frame.wgsl", "tile_span.wgsl", "tile_entries.wgsl"],
+            Module::TileRanges => &["frame.wgsl", "tile_ranges.wgsl"],
+            Module::Blend => &["frame.wgsl", "pair.wgsl", "alpha.wgsl", "blend.wgsl"],
+            Module::BlendPull => &["frame.wgsl", "pair.wgsl", "alpha.wgsl", "blend_pull.wgsl"],
+            Module::SplatSum => &["frame.wgsl", "splat_sum.wgsl"],
+            Module::ProjectionPull => &["frame.wgsl", "pair.wgsl", "linearised.wgsl", "projection_pull.wgsl"],
+        }
+    }
+
+    /// Whether its arrays, bindings 1 and on, are written: `r` or `w` for each.
+    pub fn access(self) -> &'static str {
+        match self {
+            Module::Projection => "rrrwwwww",
+            Module::Scan => "ww",
+            Module::Sort => "rrwwwr",
+            Module::TileOffsets => "rrww",
+            Module::TileEntries => "rrrrww",
+            Module::TileRanges => "rrrrww",
+            Module::Blend => "rrrrww",
+            Module::BlendPull => "rrrrrrrw",
+            Module::SplatSum => "rrrw",
+            Module::ProjectionPull => "rrrrrw",
+        }
+    }
+}
+
+/// An entry point of a module with values of its overridable constants.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Kernel {
+    /// Where it is.
+    pub module: Module,
+    /// Its name.
+    pub entry: &'static str,
+    /// Constants that differ from what the source says.
+    pub constants: Vec<(&'static str, u32)>,
+}
+
+impl Kernel {
+    fn name(&self) -> String {
+        let constants: Vec<String> = self.constants.iter().map(|(name, value)| format!("{name}={value}")).collect();
+        format!("{:?}::{} {}", self.module, self.entry, constants.join(" ")).trim_end().to_string()
+    }
+}
+
+/// A compiled kernel.
+#[derive(Debug)]
+pub(crate) struct Pipeline {
+    pub pipeline: wgpu::ComputePipeline,
+    pub layout: wgpu::BindGroupLayout,
+}
+
+/// Kernels that were compiled so far.
+#[derive(Debug)]
+pub(crate) struct Kernels {
+    sources: Sources,
+    compiled: Mutex<BTreeMap<String, Arc<Pipeline>>>,
+}
+
+impl Kernels {
+    pub fn new(sources: Sources) -> Self {
+        Self { sources, compiled: Mutex::default() }
+    }
+
+    pub fn get(&self, device: &Device, kernel: &Kernel) -> Result<Arc<Pipeline>, GpuError> {
+        let name = kernel.name();
+        let mut compiled = self.compiled.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(pipeline) = compiled.get(&name) {
+            return Ok(pipeline.clone());
+        }
+        let pipeline = Arc::new(compile(device, &self.sources, kernel, &name)?);
+        compiled.insert(name, pipeline.clone());
+        Ok(pipeline)
+    }
+}
+
+fn compile(device: &Device, sources: &Sources, kernel: &Kernel, name: &str) -> Result<Pipeline, GpuError> {
+    let Device { device, .. } = device;
+    let access = kernel.module.access();
+    debug_assert!(access.len() <= STORAGE_BINDINGS as usize);
+    let entry = |binding: usize, ty| wgpu::BindGroupLayoutEntry {
+        binding: binding as u32,
+        visibility: wgpu::ShaderStages::COMPUTE,
+        ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
+        count: None,
+    };
+    let mut entries = vec![entry(0, wgpu::BufferBindingType::Uniform)];
+    for (k, access) in access.bytes().enumerate() {
+        entries.push(entry(k + 1, wgpu::BufferBindingType::Storage { read_only: access == b'r' }));
+    }
+    let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
+    let layout =
+        device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(name), entries: &entries });
+    let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some(name),
+        bind_group_layouts: &[Some(&layout)],
+        immediate_size: 0,
+    });
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some(name),
+        source: wgpu::ShaderSource::Wgsl(sources.of(kernel.module).into()),
+    });
+    let constants: Vec<(&str, f64)> = kernel.constants.iter().map(|(name, value)| (*name, f64::from(*value))).collect();
+    let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(name),
+        layout: Some(&pipeline_layout),
+        module: &module,
+        entry_point: Some(kernel.entry),
+        // Kernels write what they read of the memory that a workgroup shares.
+        compilation_options: wgpu::PipelineCompilationOptions {
+            constants: &constants,
+            zero_initialize_workgroup_memory: false,
+        },
+        cache: None,
+    });
+    match pollster::block_on(scope.pop()) {
+        Some(error) => Err(GpuError::Kernel { kernel: name.to_string(), problem: error.to_string() }),
+        None => Ok(Pipeline { pipeline, layout }),
+    }
+}

@@ -1,0 +1,44 @@
+//! The rasteriser as WGSL on any GPU that wgpu reaches: every stage beside its CPU twin, forward and backward.
+//!
+//! Invariant: kernels use the limits that every WebGPU device has, no subgroups, and no atomic addition of floats: sums are made
+//! in a fixed order, so that two runs on one device give the same bits.
+//!
+//! ```no_run
+//! use diamond_camera::{Camera, Intrinsics, Pose};
+//! use diamond_gpu::{Device, DeviceChoice, Rasterizer};
+//! use diamond_splat::{Features, Gaussians, RasterConfig};
+//! use glam::{Quat, Vec3};
+//!
+//! let mut gaussians = Gaussians::default();
+//! gaussians.push(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.2), Quat::IDENTITY, 0.8);
+//! let features = Features { channels: 1, data: vec![0.5] };
+//! let camera = Camera { intrinsics: Intrinsics::from_fov_x(0.9, 32, 32), pose: Pose::IDENTITY };
+//! if let Some(device) = Device::open(DeviceChoice::Auto)? {
+//!     let mut rasterizer = Rasterizer::new(&device)?;
+//!     let (raster, _) = rasterizer.rasterize(&gaussians, &features, &camera, &RasterConfig::default())?;
+//!     assert!((raster.opacity.pixel(16, 16)[0] - 0.8).abs() < 0.02);
+//! }
+//! # Ok::<(), diamond_gpu::GpuError>(())
+//! ```
+mod adapter;
+mod arrays;
+mod device;
+mod error;
+mod frame;
+mod host_state;
+mod kernels;
+mod rasterizer;
+mod scene_arrays;
+mod shape;
+mod stage;
+pub mod twin;
+
+pub use adapter::{Adapter, DeviceChoice, DeviceKind, adapters, choose};
+pub use device::Device;
+pub use error::GpuError;
+pub use frame::{Coverage, Frame, GaussianGrad, Splat, TILE};
+pub use host_state::{HostState, RasterScene, Side};
+pub use kernels::{Kernel, Module, Sources};
+pub use rasterizer::{DevicePullback, DeviceStats, Rasterizer};
+pub use shape::{Column, Shape};
+pub use stage::{STAGES, Stage, StageRow};

@@ -1,0 +1,223 @@
+//! Every stage on the device against its twin on the CPU, and the whole against the CPU's rasteriser. Without a device all tests
+//! are reported as ignored, with the reason; with DIAMOND_REQUIRE_GPU=1 its absence is a failure.
+mod compare;
+mod scenes;
+
+use compare::{Difference, relative_l2};
+use diamond_gpu::{
+    Device, DeviceChoice, GpuError, HostState, RasterScene, Rasterizer, STAGES, Side, Sources, adapters,
+};
+use diamond_splat::{Cutoff, Gaussians, Raster, RasterPull, rasterize};
+use libtest_mimic::{Arguments, Failed, Trial};
+use std::process::ExitCode;
+use std::sync::OnceLock;
+
+/// Asks that a missing device is a failure and not a reason to ignore.
+const REQUIRED: &str = "DIAMOND_REQUIRE_GPU";
+
+/// The tests' device: the best there is, software too.
+fn device() -> Result<&'static Device, String> {
+    static DEVICE: OnceLock<Result<Device, String>> = OnceLock::new();
+    DEVICE.get_or_init(|| open(Sources::default())).as_ref().map_err(Clone::clone)
+}
+
+fn open(sources: Sources) -> Result<Device, String> {
+    let device = Device::open_with(DeviceChoice::Gpu(None), sources).map_err(|error| error.to_string())?;
+    device.ok_or_else(|| GpuError::NoAdapter.to_string())
+}
+
+fn main() -> ExitCode {
+    let mut arguments = Arguments::from_args();
+    let found = adapters();
+    let reason = found.is_empty().then_some("no GPU driver");
+    if reason.is_some() {
+        if std::env::var_os(REQUIRED).is_some_and(|value| value == "1") {
+            eprintln!("{REQUIRED}=1: {}", GpuError::NoAdapter);
+            return ExitCode::FAILURE;
+        }
+        // Nothing can run them.
+        (arguments.ignored, arguments.include_ignored) = (false, false);
+        println!("parity: {}", GpuError::NoAdapter);
+    } else {
+        println!("parity: on {} ({})", found[0].name, found[0].driver);
+    }
+    let trials = tests().into_iter().map(|(name, test)| {
+        let trial = Trial::test(name, move || test(device()?).map_err(Failed::from));
+        trial.with_ignored_flag(reason.is_some()).with_kind(reason.unwrap_or_default())
+    });
+    libtest_mimic::run(&arguments, trials.collect()).exit_code()
+}
+
+type Test = Box<dyn FnOnce(&'static Device) -> Result<(), String> + Send>;
+
+fn tests() -> Vec<(String, Test)> {
+    let mut tests: Vec<(String, Test)> = Vec::new();
+    for (name, scene) in scenes::all() {
+        let other = scene.clone();
+        tests.push((format!("stages, {name}"), Box::new(move |device| stages(device, name, scene))));
+        tests.push((format!("whole, {name}"), Box::new(move |device| whole(device, name, &other))));
+    }
+    tests.push(("stages, large".into(), Box::new(|device| stages(device, "large", scenes::large()))));
+    tests.push(("whole, large".into(), Box::new(|device| whole(device, "large", &scenes::large()))));
+    tests.push(("whole, in pieces".into(), Box::new(|device| whole(device, "in pieces", &scenes::in_pieces()))));
+    tests.push(("any stage may be the first on the device".into(), Box::new(switch)));
+    tests.push(("two runs give the same bits".into(), Box::new(same_bits)));
+    tests.push(("bad input is an error".into(), Box::new(bad_input)));
+    for row in STAGES {
+        tests.push((format!("planted, {}", row.name), Box::new(move |_| planted(row.name))));
+    }
+    tests
+}
+
+fn stages(device: &'static Device, name: &str, scene: RasterScene) -> Result<(), String> {
+    let state = HostState::new(scene, device.max_binding()).map_err(|error| error.to_string())?;
+    let worst = compare::stages(&state, Side::Gpu(device))
+        .map_err(|Difference { stage, what }| format!("{name}: stage {stage}: {what}"))?;
+    let worst: Vec<String> = worst.iter().map(|(stage, error)| format!("{stage} {error:.1e}")).collect();
+    println!("parity: {name}: {}", worst.join(", "));
+    Ok(())
+}
+
+/// Relative errors of a picture and its gradient.
+fn errors(a: &(Raster, RasterPull), b: &(Raster, RasterPull)) -> Vec<(&'static str, bool, f64)> {
+    let flat = |v: &RasterPull| {
+        let g = &v.gaussians;
+        [
+            g.means.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>(),
+            g.scales.iter().flat_map(|v| v.to_array()).collect(),
+            g.rotations.iter().flat_map(|v| v.to_array()).collect(),
+            g.opacities.clone(),
+            g.factors.iter().flat_map(|l| l.0).collect(),
+            v.screen.iter().flat_map(|v| v.to_array()).collect(),
+            v.features.clone(),
+        ]
+    };
+    let (pull_a, pull_b) = (flat(&a.1), flat(&b.1));
+    let names = ["d means", "d scales", "d rotations", "d opacities", "d factors", "d screen", "d features"];
+    let mut out = vec![
+        ("features", false, relative_l2(a.0.features.data(), b.0.features.data())),
+        ("opacity", false, relative_l2(a.0.opacity.data(), b.0.opacity.data())),
+        ("depth", false, relative_l2(a.0.depth.data(), b.0.depth.data())),
+    ];
+    out.extend(names.iter().zip(pull_a.iter().zip(&pull_b)).map(|(name, (a, b))| (*name, true, relative_l2(a, b))));
+    out
+}
+
+fn check(name: &str, errors: &[(&'static str, bool, f64)]) -> Result<(), String> {
+    let text: Vec<String> = errors.iter().map(|(what, _, error)| format!("{what} {error:.1e}")).collect();
+    println!("parity: {name}: {}", text.join(", "));
+    match errors.iter().find(|(_, backward, error)| *error > if *backward { 1e-4 } else { 1e-5 }) {
+        Some((what, _, error)) => Err(format!("{name}: {what}: relative error {error:.2e}")),
+        None => Ok(()),
+    }
+}
+
+fn on_cpu(scene: &RasterScene) -> Result<(Raster, RasterPull), String> {
+    let (raster, pullback) = rasterize(&scene.gaussians, &scene.features, &scene.camera, &scene.config)
+        .map_err(|error| error.to_string())?;
+    let pull = pullback.pull(&scene.d).map_err(|error| error.to_string())?;
+    Ok((raster, pull))
+}
+
+fn on_device(rasterizer: &mut Rasterizer<'_>, scene: &RasterScene) -> Result<(Raster, RasterPull), GpuError> {
+    let (raster, pullback) = rasterizer.rasterize(&scene.gaussians, &scene.features, &scene.camera, &scene.config)?;
+    let pull = pullback.pull(&scene.d)?;
+    Ok((raster, pull))
+}
+
+fn whole(device: &'static Device, name: &str, scene: &RasterScene) -> Result<(), String> {
+    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+    let found = on_device(&mut rasterizer, scene).map_err(|error| error.to_string())?;
+    let expected = on_cpu(scene)?;
+    if found.0.stats.visible != expected.0.stats.visible {
+        return Err(format!("visible: {} and {}", found.0.stats.visible, expected.0.stats.visible));
+    }
+    check(name, &errors(&found, &expected))
+}
+
+/// The first stages on the CPU, the rest on the device, for every number of stages.
+fn switch(device: &'static Device) -> Result<(), String> {
+    let (_, scene) = scenes::all().swap_remove(0);
+    let state = HostState::new(scene.clone(), device.max_binding()).map_err(|error| error.to_string())?;
+    let expected = on_cpu(&scene)?;
+    for on_cpu in 0..=STAGES.len() {
+        let mut state = state.clone();
+        state.run_all(on_cpu, device).map_err(|error| error.to_string())?;
+        let picture = relative_l2(&state.picture(), expected.0.features.data());
+        let gradient = relative_l2(&state.d_features(), &expected.1.features);
+        if picture > 1e-5 || gradient > 1e-4 {
+            return Err(format!("{on_cpu} stages on the CPU: picture {picture:.2e}, gradient {gradient:.2e}"));
+        }
+    }
+    Ok(())
+}
+
+fn same_bits(device: &'static Device) -> Result<(), String> {
+    let scene = scenes::large();
+    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+    let mut run = || on_device(&mut rasterizer, &scene).map_err(|error| error.to_string());
+    let (first, second) = (run()?, run()?);
+    if first != second {
+        return Err("the second run has other bits".into());
+    }
+    Ok(())
+}
+
+fn bad_input(device: &'static Device) -> Result<(), String> {
+    let (_, scene) = scenes::all().swap_remove(0);
+    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+    type Damage = fn(&mut RasterScene);
+    let damages: [(&str, Damage); 5] = [
+        ("a mean that is no number", |s| s.gaussians.means[3].x = f32::NAN),
+        ("a feature that is no number", |s| s.features.data[1] = f32::INFINITY),
+        ("too few features", |s| s.features.data.truncate(7)),
+        ("a cut-off for tests", |s| s.config.cutoff = Cutoff::Smooth),
+        ("a cotangent of another shape", |s| s.d = diamond_splat::RasterGrad::zeros(3, 3, 5)),
+    ];
+    for (what, damage) in damages {
+        let mut scene = scene.clone();
+        damage(&mut scene);
+        match on_device(&mut rasterizer, &scene) {
+            Ok(_) => return Err(format!("{what} was accepted")),
+            Err(error) => println!("parity: {what}: {error}"),
+        }
+    }
+    let mut scene = scene;
+    scene.gaussians = Gaussians::default();
+    scene.features.data.clear();
+    on_device(&mut rasterizer, &scene).map(|_| ()).map_err(|error| error.to_string())
+}
+
+/// An error planted in one stage's kernels: file, what stands there, what is put there.
+fn plants(stage: &str) -> Option<(&'static str, &'static str, &'static str)> {
+    Some(match stage {
+        "projection" => ("projection.wgsl", "pair_of(frame.principal.x)", "pair_of(frame.principal.x * 1.00001)"),
+        "depth_sort" => {
+            ("sort.wgsl", "values_out[place] = values_in[i];", "values_out[place] = values_in[i ^ u32(SHIFT == 8u)];")
+        }
+        "tile_offsets" => ("tile_offsets.wgsl", "tile_counts[depth_order[rank]]", "tile_counts[rank]"),
+        "tile_entries" => ("tile_entries.wgsl", "row * frame.tiles.x + column", "row * frame.tiles.x + column + row"),
+        // The sort by depth has another count.
+        "tile_sort" => ("sort.wgsl", "var place = places[digit];", "var place = places[digit ^ COUNT];"),
+        "tile_ranges" => ("tile_ranges.wgsl", "ranges[tile].y = i + 1u;", "ranges[tile].y = i;"),
+        "blend" => ("blend.wgsl", "let w = t * a;", "let w = t * a * 1.0001;"),
+        "blend_pull" => ("blend_pull.wgsl", "behind = fma(a, gain, behind);", "behind = fma(a, gain, behind * 0.999);"),
+        "splat_sum" => ("splat_sum.wgsl", "entry < end;", "entry + 1u < end;"),
+        "projection_pull" => ("projection_pull.wgsl", "d_k += d_s[j] * c.s;", "d_k += d_s[j] * c.s * 1.001;"),
+        _ => return None,
+    })
+}
+
+/// The harness finds the error, and in the stage where it is.
+fn planted(stage: &'static str) -> Result<(), String> {
+    let (file, from, to) = plants(stage).ok_or("no error is planted in this stage")?;
+    let sources = Sources::default().with_edit(file, from, to).ok_or("there is nothing to replace")?;
+    let device = open(sources)?;
+    let (_, scene) = scenes::all().swap_remove(0);
+    let state = HostState::new(scene, device.max_binding()).map_err(|error| error.to_string())?;
+    match compare::stages(&state, Side::Gpu(&device)) {
+        Ok(_) => Err(format!("an error in {stage} was not found")),
+        Err(found) if found.stage == stage => Ok(()),
+        Err(found) => Err(format!("an error in {stage} was taken for one in {}: {}", found.stage, found.what)),
+    }
+}
