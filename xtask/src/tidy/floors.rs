@@ -107,7 +107,13 @@ pub const PACKAGES: &[Package] = &[
         alone: Some(&["glam", "libm"]),
     },
     heavy("diamond-pathtrace", 2, &["glam", "rayon", "obvhs", "rand_pcg", "tobj", "gltf", "base64"]),
+    heavy(
+        "diamond-diffusion",
+        2,
+        &["glam", "libm", "rayon", "candle-core", "gemm", "rand_chacha", "safetensors", "half", "serde", "serde_json"],
+    ),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
+    heavy("diamond-lpips", 3, &["candle-core"]),
     heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2", "safetensors", "half"]),
     heavy("diamond-medium", 3, &["glam", "rayon", "serde", "toml", "libm"]),
     heavy("diamond-reconstruct", 4, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
