@@ -14,6 +14,8 @@ pub mod nn;
 pub mod unet;
 
 mod error;
+#[cfg(test)]
+mod gradient_check;
 mod noise;
 mod parameterization;
 mod sampler;

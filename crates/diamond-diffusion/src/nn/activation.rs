@@ -31,8 +31,8 @@ pub fn softmax(x: &Tensor) -> Result<Tensor> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, variable};
     use super::*;
+    use crate::gradient_check::{check, variable};
 
     #[test]
     fn gradients_and_known_values() {

@@ -101,9 +101,9 @@ impl FeedForward {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, variable};
     use super::super::variables::{Source, VariablesBuilder};
     use super::*;
+    use crate::gradient_check::{check, variable};
     use candle_core::DType;
 
     /// [eq:attention]: one block and several, as many keys as queries and not.

@@ -53,9 +53,9 @@ impl Conv2d {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, check_layer, variable, weighed_sum};
     use super::super::variables::{Source, VariablesBuilder};
     use super::*;
+    use crate::gradient_check::{check, check_layer, variable, weighed_sum};
     use candle_core::{DType, Var};
 
     /// (kernel, stride, padding, height, width): several tiles, blocks and borders, 1 × 1, strides, an even kernel.

@@ -46,9 +46,9 @@ impl Linear {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check_layer, variable};
     use super::super::variables::{Source, VariablesBuilder};
     use super::*;
+    use crate::gradient_check::{check_layer, variable};
     use candle_core::DType;
 
     #[test]

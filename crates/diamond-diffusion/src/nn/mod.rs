@@ -20,9 +20,6 @@ mod resize;
 mod time_embedding;
 mod variables;
 
-#[cfg(test)]
-pub(crate) mod gradient_check;
-
 pub use activation::{gelu, sigmoid, silu, softmax};
 pub use attention::{Attention, FeedForward, attend};
 pub use conv::Conv2d;

@@ -108,9 +108,9 @@ impl LayerNorm {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, check_layer, variable};
     use super::super::variables::{Source, VariablesBuilder};
     use super::*;
+    use crate::gradient_check::{check, check_layer, variable};
     use candle_core::{DType, Device};
 
     /// [eq:group-norm]

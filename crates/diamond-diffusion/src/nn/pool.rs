@@ -84,8 +84,8 @@ pub fn max_pool2d(x: &Tensor, kernel: usize, stride: usize) -> Result<Tensor> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, variable};
     use super::*;
+    use crate::gradient_check::{check, variable};
 
     #[test]
     fn windows_that_overlap_and_that_do_not_have_their_gradient() {

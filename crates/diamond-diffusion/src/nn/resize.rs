@@ -79,8 +79,8 @@ pub fn resize_bilinear(x: &Tensor, height: usize, width: usize, align_corners: b
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check, variable};
     use super::*;
+    use crate::gradient_check::{check, variable};
 
     fn values(x: &Tensor) -> Vec<f64> {
         x.flatten_all().unwrap().to_vec1().unwrap()

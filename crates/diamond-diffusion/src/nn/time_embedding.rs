@@ -45,9 +45,9 @@ impl TimeEmbedding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::gradient_check::{check_layer, variable};
     use super::super::variables::{Source, VariablesBuilder};
     use super::*;
+    use crate::gradient_check::{check_layer, variable};
 
     /// [eq:timestep-embedding]: cosines first, a timestep of its own for each picture.
     #[test]

@@ -141,7 +141,7 @@ fn loss(unet: &UNet, control: &ControlNet, inputs: &Inputs, timesteps: &[f32]) -
     let control = control.forward(&inputs.x, timesteps, &inputs.hints, &conditions).unwrap();
     let out = unet.forward(&inputs.x, timesteps, &conditions, Some(&control)).unwrap();
     assert_eq!(out.dims(), [timesteps.len(), 2, 4, 6]);
-    crate::nn::gradient_check::weighed_sum(&out).unwrap()
+    crate::gradient_check::weighed_sum(&out).unwrap()
 }
 
 /// Every weight has a gradient, and the derivative along a random direction of all weights at once is that of differences.

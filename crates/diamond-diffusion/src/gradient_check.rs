@@ -2,7 +2,7 @@
 //!
 //! The rest of the workspace has dual numbers for this. Candle's tensors cannot hold them, but run in `f64`, where central
 //! differences with a step of 1e-5 have errors of 1e-9 or so: enough to show a missing factor on a small term.
-use super::Variables;
+use crate::nn::Variables;
 use crate::noise::Noise;
 use candle_core::{DType, Result, Tensor, Var};
 
