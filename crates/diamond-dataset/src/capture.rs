@@ -196,6 +196,8 @@ pub(crate) struct Shared {
     /// Images that are asked whether RGB is premultiplied, spread evenly over the capture as opened.
     pub(crate) witnesses: Vec<Shot>,
     pub(crate) premultiplied: OnceLock<bool>,
+    /// Every light of the training images as opened, each once, in the order in which they first appear.
+    pub(crate) rig: Vec<OlatLight>,
     /// What the files had in them when the capture was hashed.
     pub(crate) identity: OnceLock<Identity>,
 }
@@ -271,6 +273,7 @@ impl Capture {
                 images,
                 witnesses: spread(&train, 8),
                 premultiplied: OnceLock::new(),
+                rig: crate::select::different_lights(&train),
                 identity: OnceLock::new(),
             }),
             root: found.root,

@@ -270,6 +270,12 @@ impl Capture {
     pub fn shared_rig(&self, split: Split) -> Option<Vec<OlatLight>> {
         shared_rig(self.views(split)).filter(|rig| !rig.is_empty())
     }
+
+    /// The rig: every light of the training images of the capture as opened, whatever is selected; each position or direction once, in the order in
+    /// which they first appear. Held-out images have no say.
+    pub fn rig(&self) -> &[OlatLight] {
+        &self.shared.rig
+    }
 }
 
 /// Directions from the centre of the scene to the cameras.
@@ -370,13 +376,19 @@ pub(crate) fn key(light: &OlatLight) -> LightKey {
     (point, v.to_array().map(|x| (x + 0.0).to_bits()))
 }
 
-/// See [`Capture::shared_rig`].
-pub(crate) fn shared_rig(views: &[View]) -> Option<Vec<OlatLight>> {
+/// The lights of views, each position or direction once, in the order in which they first appear.
+pub(crate) fn different_lights(views: &[View]) -> Vec<OlatLight> {
     let mut lights = Vec::new();
     let mut seen = BTreeMap::new();
     for shot in views.iter().flat_map(|view| &view.shots) {
         seen.entry(key(&shot.light)).or_insert_with(|| lights.push(shot.light));
     }
+    lights
+}
+
+/// See [`Capture::shared_rig`].
+pub(crate) fn shared_rig(views: &[View]) -> Option<Vec<OlatLight>> {
+    let lights = different_lights(views);
     let fullest = views.iter().map(|view| view.shots.len()).max().unwrap_or(0);
     (lights.len() <= fullest).then_some(lights)
 }

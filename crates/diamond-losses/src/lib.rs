@@ -10,7 +10,7 @@
 //!
 //! | term | function | rendered side |
 //! |---|---|---|
-//! | photometric | [`photometric`] | image, any channels |
+//! | photometric | [`photometric`], [`believed_photometric`] | image, any channels |
 //! | mask, mask entropy | [`mask_bce`], [`mask_entropy`] | opacity, 1 channel |
 //! | normal | [`normal_consistency`] | normals, 3 channels |
 //! | smoothness | [`smoothness`] | material map, 1 or 3 channels |
@@ -27,6 +27,7 @@
 //! # Ok::<(), diamond_losses::LossError>(())
 //! ```
 mod average;
+mod believed;
 mod compare;
 mod encode;
 mod enhancement;
@@ -39,6 +40,7 @@ mod terms;
 mod visibility;
 
 pub use average::Average;
+pub use believed::believed_photometric;
 pub use encode::encode_image;
 pub use enhancement::{enhanced, enhancement};
 pub use error::LossError;

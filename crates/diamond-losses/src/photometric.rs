@@ -81,6 +81,26 @@ fn photometric_with(
     options: &PhotometricOptions,
     weight: f32,
 ) -> Result<PhotometricLoss, LossError> {
+    checked(rendered, target, options, weight)?;
+    let space = options.space;
+    if space == Transfer::Linear {
+        return compared(rendered, rendered, target, options, weight);
+    }
+    let seen = encode_image(space, rendered);
+    if encoded {
+        compared(rendered, &seen, target, options, weight)
+    } else {
+        compared(rendered, &seen, &encode_image(space, target), options, weight)
+    }
+}
+
+/// Refuses parameters and images that have no loss.
+pub(crate) fn checked(
+    rendered: &Image,
+    target: &Image,
+    options: &PhotometricOptions,
+    weight: f32,
+) -> Result<(), LossError> {
     let lambda = options.lambda_ssim;
     if !(0.0..=1.0).contains(&lambda) {
         let what = "photometric loss: lambda_ssim";
@@ -98,16 +118,7 @@ fn photometric_with(
         let expected = "at least one pixel".to_owned();
         return Err(LossError::Shape { what: "photometric loss", expected, found: "none".to_owned() });
     }
-    let space = options.space;
-    if space == Transfer::Linear {
-        return compared(rendered, rendered, target, options, weight);
-    }
-    let seen = encode_image(space, rendered);
-    if encoded {
-        compared(rendered, &seen, target, options, weight)
-    } else {
-        compared(rendered, &seen, &encode_image(space, target), options, weight)
-    }
+    Ok(())
 }
 
 /// The loss of `linear`, which is `a` encoded, against the encoded `b`: SSIM in one fused pass, and everything else in

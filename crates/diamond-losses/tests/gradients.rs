@@ -85,6 +85,35 @@ proptest! {
         }
     }
 
+    /// [eq:believed] in linear and in encoded space; a weight of another pixel is noticed.
+    #[test]
+    fn believed_photometric_agrees(
+        (w, h, c, a, b, m) in (1usize..6, 1usize..6, 1usize..=3).prop_flat_map(|(w, h, c)| {
+            (Just(w), Just(h), Just(c), picture(w * h * c), picture(w * h * c), mask(w * h))
+        }),
+        lambda_ssim in 0.0f32..1.0, lambda_l2 in 0.0f32..2.0,
+    ) {
+        // Where encoded values differ by less than rounding, the sign of their difference is anybody's.
+        prop_assume!(a.iter().zip(&b).all(|(p, q)| p == q || (p - q).abs() > 1e-5));
+        let image = |v: &[f32], c: usize| Image::from_vec(w, h, c, v.to_vec()).unwrap();
+        for space in [Transfer::Linear, Transfer::Srgb] {
+            let options = PhotometricOptions { lambda_ssim, lambda_l2, space, ..Default::default() };
+            let loss = believed_photometric(&image(&a, c), &image(&b, c), &image(&m, 1), &options).unwrap();
+            let seen = |v: &[Dual]| -> Vec<Dual> {
+                v.iter().map(|&v| if space == Transfer::Srgb { oracle::srgb(v) } else { v }).collect()
+            };
+            let target = seen(&constants(&f64s(&b)));
+            let (l1, l2) = (f64::from(lambda_ssim), f64::from(lambda_l2));
+            let of = |m: &[f64], x: &[Dual]| oracle::believed_photometric(&seen(x), &target, m, (w, h, c), l1, l2);
+            agree!(loss.value, loss.grad.data(), |x| of(&f64s(&m), x), &a);
+            let mut moved = f64s(&m);
+            moved[0] += 0.5;
+            let differs = (0..c).any(|k| a[k] != b[k]) && l1 < 0.99;
+            let noticed = disagreement(loss.value, loss.grad.data(), |x| of(&moved, x), &a).is_some();
+            prop_assert!(noticed || !differs);
+        }
+    }
+
     /// [eq:mask-bce] [eq:mask-entropy] [eq:opacity-entropy]
     #[test]
     fn opacity_terms_agree(

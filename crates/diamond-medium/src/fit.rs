@@ -99,7 +99,7 @@ pub(crate) fn white(light: &OlatLight) -> OlatLight {
     }
 }
 
-fn key(light: &OlatLight) -> [u32; 4] {
+pub(crate) fn key(light: &OlatLight) -> [u32; 4] {
     let (kind, v) = match *light {
         OlatLight::Point { position, .. } => (0, position),
         OlatLight::Directional { direction, .. } => (1, direction),

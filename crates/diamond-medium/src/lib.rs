@@ -1,11 +1,12 @@
 //! A homogeneous medium inside a surface: fitted to a few photographs, and the light that leaves it under any light.
 //!
-//! Three steps, each of use on its own:
+//! Steps, each of use on its own:
 //!
 //! - [`carve`] makes a closed [`Surface`] from points and silhouettes, with surfels between which light is carried;
 //! - [`fit_profile`] and [`fit_walk`] find a [`Medium`] in it that explains photographs under known lights: a radial profile by least squares, or σ_t and albedo by random
 //!   walks. Everything is linear in the light, so one photograph is enough to render lights that nobody lit;
-//! - [`Exitance`] is the light that leaves each surfel under any lights.
+//! - [`Exitance`] is the light that leaves each surfel under any lights, [`MediumPictures`] what a camera sees of it;
+//! - [`Prior`] makes pictures that nobody took of it, with a confidence that its error on the photographs decides, as a [`Source`](diamond_augment::Source).
 //!
 //! This crate knows surfaces and photographs. It knows neither Gaussians nor networks nor how a run goes on; `diamond-reconstruct` makes a part of its model of it.
 //!
@@ -31,6 +32,8 @@ mod fit;
 mod medium;
 mod near;
 mod orient;
+mod prior;
+mod sight;
 mod surface;
 mod walk_fit;
 pub use carve::{CarveOptions, OrientedPoint, Silhouette, carve, hull_bounds};
@@ -40,5 +43,7 @@ pub use fit::{COATS, FitImage, FitOptions, fit_profile, offered_widths};
 pub use medium::{Coat, Described, Medium, Quality, Transport};
 pub use near::Near;
 pub use orient::outward_normals;
+pub use prior::{Prior, PriorOptions};
+pub use sight::{MediumPictures, Sight};
 pub use surface::{Attachment, Surface};
 pub use walk_fit::fit_walk;

@@ -110,6 +110,8 @@ pub struct Described {
 const BAD_FIT: f32 = 0.3;
 /// More of the difference than this under all lights alike is texture.
 const TEXTURED: f32 = 0.5;
+/// A profile whose mean distance is beyond this part of that of its widest Gaussian would be wider still.
+const CROSSES: f32 = 0.9;
 /// Media below this reflectance return hardly any light.
 const DARK: f32 = 0.02;
 
@@ -200,10 +202,25 @@ impl Medium {
             ));
         } else if radius.max_element() < 1.5 * spacing {
             out.push(
-                "medium: opaque; light leaves where it enters, as far as surfels can tell: `mlp` is enough".into(),
+                "medium: opaque; light leaves where it enters, as far as surfels can tell: what is fitted is a matt surface, not a medium".into(),
             );
         }
         out
+    }
+
+    /// Why a fit should not stand for the light in an object, where it should not: the profile has gone to the widest Gaussian that it was offered, in every
+    /// channel. Then light crosses the object with hardly any scattering, and how much leaves a place depends on what lies behind it, which no
+    /// profile knows. (A network alone is then 1 to 2 dB better; docs/results.md has the numbers.)
+    pub fn unfit(&self) -> Option<String> {
+        let Transport::Profile { widths, .. } = &self.transport else { return None };
+        let widest = widths.iter().copied().fold(0.0f32, f32::max);
+        // The mean distance from the middle of a Gaussian in the plane.
+        let most = (0.5 * std::f32::consts::PI).sqrt() * widest;
+        let least = self.mean_radius().min_element();
+        (most > 0.0 && least > CROSSES * most && self.reflectance().min_element() > DARK).then(|| {
+            let badly = self.quality.map_or(String::new(), |q| format!(" (difference {:.0} % of the photographs)", 100.0 * q.relative_error));
+            format!("light crosses the object with hardly any scattering, which no radial profile explains{badly}: the network learns it without a medium")
+        })
     }
 
     /// The profile without its local part; errors for media that have none.

@@ -37,4 +37,6 @@ pub use flip_hdr::{FlipExposures, FlipHdr, FlipHdrOptions, FlipToneMapper, flip_
 pub use geometry::{depth_error, silhouette_iou};
 pub use masked::masked_mean;
 pub use psnr::{l1, mse, psnr, psnr_channels, psnr_masked};
-pub use ssim::{Ssim, SsimGrad, SsimPullback, SsimWindow, ssim, ssim_masked, ssim_mean, ssim_mean_and_grad};
+pub use ssim::{
+    Ssim, SsimGrad, SsimPullback, SsimWindow, ssim, ssim_masked, ssim_mean, ssim_mean_and_grad, ssim_weighted_and_grad,
+};

@@ -189,6 +189,27 @@ pub fn ssim_mean_and_grad(a: &Image, b: &Image, window: SsimWindow) -> Result<(f
     Ok((mean, Image::from_vec(width, height, channels, rows.d_a)?))
 }
 
+/// Σ w·SSIM / count over all values of all channels with a weight `weights` for each pixel (one channel), the sum of w over the same count, and the gradient of the
+/// first with respect to the first image (its shape): one fused pass, for images of which parts are believed more than others. `count` is the number of
+/// values, not the sum of weights, so that what has little weight everywhere counts little. Zero-padded windows. Errors as [`ssim`], and for weights of
+/// another size or not finite.
+pub fn ssim_weighted_and_grad(a: &Image, b: &Image, weights: &Image) -> Result<(f64, f64, Image), MetricError> {
+    let window = SsimWindow::ZeroPadded;
+    check(a, b, window)?;
+    let (width, height, channels) = a.shape();
+    weights.expect_shape((width, height, 1), "SSIM: weights")?;
+    expect_finite(weights, "SSIM: weights")?;
+    let scale = 1.0 / count(a, window);
+    let spread: Vec<f32> =
+        weights.data().iter().flat_map(|w| std::iter::repeat_n((f64::from(*w) * scale) as f32, channels)).collect();
+    let wanted = Wanted { map: true, gradient: Some(Cotangent::Map(&spread)), both: false };
+    let rows = rows(pair(a, b, window), wanted);
+    let each = rows.map.chunks_exact(channels.max(1)).zip(weights.data());
+    let sum: f64 = each.map(|(s, w)| f64::from(*w) * s.iter().map(|s| f64::from(*s)).sum::<f64>()).sum();
+    let whole = weights.data().iter().map(|w| f64::from(*w)).sum::<f64>() * channels as f64;
+    Ok((sum * scale, whole * scale, Image::from_vec(width, height, channels, rows.d_a)?))
+}
+
 /// Mean of the SSIM map inside a mask (same width and height), weighted by coverage. The windows themselves are not
 /// masked: a pixel's neighbours outside the mask take part in its statistics. Errors as [`ssim`], and for a mask of
 /// another size or without coverage.

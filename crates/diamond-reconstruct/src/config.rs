@@ -3,7 +3,7 @@
 //! A file may name a `base` preset and say only what differs. Unknown keys are errors, so that a typing mistake never
 //! silently leaves a default in place. Step numbers are fractions of the run's length unless the name says `steps`.
 use crate::error::brief;
-use crate::{ByteSize, InstructionChoice, ReconstructError};
+use crate::{AugmentationSettings, ByteSize, InstructionChoice, ReconstructError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -64,6 +64,9 @@ pub struct Config {
     /// Photometric stereo of single views.
     #[serde(default)]
     pub photometric: Photometric,
+    /// Pictures that nobody took.
+    #[serde(default)]
+    pub augmentation: AugmentationSettings,
     /// Density control.
     pub density: Density,
 }
@@ -914,6 +917,7 @@ impl Config {
     /// Checks ranges; `origin` names the file in errors.
     pub fn validate(&self, origin: &str) -> Result<(), ReconstructError> {
         let fail = |detail: String| Err(ReconstructError::Config { origin: origin.to_owned(), detail });
+        self.augmentation.validate(origin)?;
         let medium = &self.subsurface;
         if medium.model.has_medium() {
             if self.shading.incident == IncidentVariant::Learned || !self.residual.scale_by_light {

@@ -6,8 +6,9 @@ use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
-    Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, GaussianParameters, Layout,
-    MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, TensorFile, TrainingPair, adam, error,
+    Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, ExposureMode,
+    GaussianParameters, Layout, MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport,
+    TensorFile, TrainingPair, adam, error,
 };
 use crate::{forward, mcmc, residual_pull};
 use diamond_camera::Camera;
@@ -233,10 +234,16 @@ impl Engine for CpuEngine {
                 }),
             };
             let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
-            let gain = self.model.exposure.index(self.model.config.exposure.mode, pair.view, pair.image);
+            let mode = self.model.config.exposure.mode;
+            // Pictures that nobody took have the exposure of renderings, and do not change it.
+            let (own, factor) = match pair.believed {
+                None => (true, plan.exposure_factor),
+                Some(_) => (mode == ExposureMode::Global, 0.0),
+            };
+            let gain = self.model.exposure.index(mode, pair.view, pair.image).filter(|_| own);
             let step_gain = gain.map(|i| {
                 let model = &self.model;
-                move |fitted| model.exposure.toward(&model.config, i, fitted, plan.exposure_factor)
+                move |fitted| model.exposure.toward(&model.config, i, fitted, factor)
             });
             let mut outcome = None;
             let pulled = forward::value_and_grad(&pass, &mut meters, |view| {
@@ -251,7 +258,7 @@ impl Engine for CpuEngine {
                 self.counters.add("PSNR encoded anew", usize::from(outcome.psnr_encoded));
                 terms.add(&outcome.terms, share);
                 psnr += outcome.psnr * share;
-                gains.extend(gain.zip(outcome.log_gain));
+                gains.extend(gain.zip(outcome.log_gain).filter(|_| pair.believed.is_none()));
             }
             pulled.agreement.iter().for_each(|term| self.counters.add(term.name, 1));
             terms.add(&pulled.agreement, share);
@@ -415,6 +422,7 @@ impl Engine for CpuEngine {
         let falloff = self.model.scene.falloff(&self.model.config);
         self.model.medium = MediumTerm::restore(path, &mut state, n, self.model.config.subsurface.surfels, falloff)?;
         self.model.parameters = parameters;
+        self.model.match_residual_output();
         Ok(())
     }
 

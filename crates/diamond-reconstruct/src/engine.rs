@@ -28,13 +28,15 @@ pub struct TrainingPair<'a> {
     pub radiance: &'a Image,
     /// Coverage, where known.
     pub mask: Option<&'a Mask>,
-    /// Weight in the photometric terms (1 for photographs).
+    /// Weight in the photometric terms (1 for photographs); of a picture that nobody took also in the mask's.
     pub weight: f32,
+    /// Of a picture that nobody took how much of each pixel is believed, one channel, 0 … 1; `None` for photographs.
+    pub believed: Option<&'a Image>,
     /// The rectangle outside of which `radiance` and `mask` are 0 everywhere; `None` where they are so altogether.
     pub content: Option<Region>,
     /// Index of the training view.
     pub view: usize,
-    /// Index of the photograph among all training photographs.
+    /// Index of the photograph among all training photographs; `usize::MAX` where it is none.
     pub image: usize,
     /// Another training view for geometric consistency; `None` where there is none or this step compares nothing.
     pub neighbour: Option<Neighbour<'a>>,
@@ -51,7 +53,7 @@ pub struct StepReport {
     pub objective: f32,
     /// Each term: name, weight, value (mean over the batch).
     pub terms: Vec<TermValue>,
-    /// PSNR of the rendered training images in display sRGB, all pixels, dB.
+    /// PSNR of the rendered training images in display sRGB, all pixels, dB; pictures that nobody took among them.
     pub psnr: f32,
     /// Gaussians after the step.
     pub gaussians: usize,

@@ -2,6 +2,7 @@
 //! pictures is filled.
 use crate::ReconstructError;
 use crate::region::Region;
+use diamond_augment::{Lack, Wanted};
 use diamond_dataset::{Capture, Shot, Split};
 use diamond_light::OlatLight;
 use serde::Serialize;
@@ -23,7 +24,11 @@ pub struct CaptureFacts {
     pub lights: usize,
     /// Whether every view has the same lights.
     pub shared_rig: bool,
-    /// Lights at infinity among them.
+    /// Different lights of the training images as the capture was opened, selected or not: the rig.
+    pub rig_lights: usize,
+    /// Pairs of a training view and a light of the rig that are not among the training images.
+    pub missing_pairs: usize,
+    /// Lights at infinity among the lights.
     pub directional_lights: usize,
     /// Held-out views.
     pub test_views: usize,
@@ -88,6 +93,8 @@ impl CaptureFacts {
             most_view_images: capture.train.iter().map(|v| v.shots.len()).max().unwrap_or(0),
             shared_rig: capture.shared_rig(Split::Train).is_some(),
             directional_lights: lights.iter().filter(|l| matches!(l, OlatLight::Directional { .. })).count(),
+            rig_lights: capture.rig().len(),
+            missing_pairs: Lack::of(capture, &Wanted::default()).missing(),
             lights: lights.len(),
             test_views: capture.test.len(),
             test_images: capture.test.iter().map(|v| v.shots.len()).sum(),

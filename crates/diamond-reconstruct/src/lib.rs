@@ -16,6 +16,8 @@
 //! ```
 pub mod adam;
 mod agreement;
+mod augmentation;
+mod augmentation_settings;
 mod byte_size;
 mod channel_layout;
 mod config;
@@ -45,9 +47,12 @@ mod residual_pull;
 mod rows;
 mod scene;
 mod schedule;
+mod stored_medium;
 mod tensor_file;
+mod turns;
 mod visibility_cache;
 
+pub use augmentation_settings::{AugmentationSettings, AugmentationSource};
 pub use byte_size::ByteSize;
 pub use channel_layout::ChannelLayout;
 pub use config::*;

@@ -7,8 +7,8 @@ use crate::{Config, InitialSource, Model, ReconstructError, Renderer, error};
 use diamond_dataset::{Capture, Observation, Shot, View};
 use diamond_image::Image;
 use diamond_medium::{
-    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Silhouette, Surface, carve, fit_profile, fit_walk,
-    hull_bounds, outward_normals,
+    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Prior, PriorOptions, Silhouette, Surface, carve,
+    fit_profile, fit_walk, hull_bounds, outward_normals,
 };
 use diamond_pathtrace::RepairOptions;
 use diamond_shading::pseudo_normals;
@@ -145,21 +145,25 @@ fn given(path: &Path, surfels: usize) -> Result<Surface, ReconstructError> {
     Surface::new(repaired.0, surfels).map_err(|e| fail(e.to_string()))
 }
 
-/// Fits a medium within `surface` to the training photographs.
-pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
-    let shots: Vec<(&View, &Shot)> = capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
-    let chosen: Vec<(&View, &Shot)> = spread(&shots, FIT_IMAGES).copied().collect();
-    let observations: Vec<Arc<Observation>> =
-        chosen.iter().map(|(_, shot)| capture.observation(shot)).collect::<Result<_, _>>()?;
-    let tints = match model.medium {
-        Some(_) => tint_maps(model, &chosen)?,
-        None => Vec::new(),
-    };
-    let images: Vec<FitImage<'_>> = chosen
-        .iter()
-        .zip(&observations)
-        .enumerate()
-        .map(|(i, ((view, shot), observation))| FitImage {
+/// Photographs of a capture that a medium is compared with, and what they show.
+struct Photographs<'c> {
+    chosen: Vec<(&'c View, &'c Shot)>,
+    observations: Vec<Arc<Observation>>,
+}
+
+impl<'c> Photographs<'c> {
+    fn of(capture: &'c Capture) -> Result<Self, ReconstructError> {
+        let shots: Vec<(&View, &Shot)> =
+            capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
+        let chosen: Vec<(&View, &Shot)> = spread(&shots, FIT_IMAGES).copied().collect();
+        let observations = chosen.iter().map(|(_, shot)| capture.observation(shot)).collect::<Result<_, _>>()?;
+        Ok(Self { chosen, observations })
+    }
+
+    /// With a factor for each photograph on what leaves the medium, where there are some.
+    fn images<'a>(&'a self, tints: &'a [Arc<Image>]) -> Vec<FitImage<'a>> {
+        let each = self.chosen.iter().zip(&self.observations).enumerate();
+        each.map(|(i, ((view, shot), observation))| FitImage {
             camera: &view.camera,
             light: &shot.light,
             radiance: &observation.radiance,
@@ -167,7 +171,18 @@ pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<
             tint: tints.get(i).map(|t| t.as_ref()),
             known: None,
         })
-        .collect();
+        .collect()
+    }
+}
+
+/// Fits a medium within `surface` to the training photographs.
+pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
+    let photographs = Photographs::of(capture)?;
+    let tints = match model.medium {
+        Some(_) => tint_maps(model, &photographs.chosen)?,
+        None => Vec::new(),
+    };
+    let images = photographs.images(&tints);
     let options = FitOptions {
         widths: model.config.subsurface.widths,
         falloff: model.scene.falloff(&model.config),
@@ -176,6 +191,20 @@ pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<
     };
     let fit = if model.config.subsurface.model.walks() { fit_walk } else { fit_profile };
     fit(surface, &images, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+}
+
+/// The physical prior as a source of pictures: a surface with a medium, and its error on the training photographs.
+pub(crate) fn prior_of(
+    model: &Model,
+    capture: &Capture,
+    surface: Surface,
+    medium: Medium,
+) -> Result<Prior, ReconstructError> {
+    let settings = &model.config.augmentation;
+    let options = PriorOptions { half_error: settings.half_error, ..PriorOptions::default() };
+    let (photographs, falloff) = (Photographs::of(capture)?, model.scene.falloff(&model.config));
+    Prior::new(surface, medium, falloff, &photographs.images(&[]), options)
+        .map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
 }
 
 /// Tints as the views show them; neighbouring photographs of one view share theirs.
@@ -193,10 +222,19 @@ fn tint_maps(model: &Model, chosen: &[(&View, &Shot)]) -> Result<Vec<Arc<Image>>
     Ok(out)
 }
 
-/// Surface and medium of a model as it stands, ready to be adopted.
-pub fn fit_medium(model: &Model, capture: &Capture) -> Result<MediumTerm, ReconstructError> {
+/// Surface and medium of a model as it stands; `Unusable` where there is no surface, or light in the object is not what a medium of this kind explains.
+pub(crate) fn surface_and_medium(model: &Model, capture: &Capture) -> Result<(Surface, Medium), ReconstructError> {
     let surface = surface_of(model, capture)?;
     let medium = medium_of(model, capture, &surface)?;
+    match medium.unfit() {
+        Some(detail) => Err(ReconstructError::Unusable { detail }),
+        None => Ok((surface, medium)),
+    }
+}
+
+/// Surface and medium of a model as it stands, ready to be adopted; see [`Medium::unfit`] for what is refused.
+pub fn fit_medium(model: &Model, capture: &Capture) -> Result<MediumTerm, ReconstructError> {
+    let (surface, medium) = surface_and_medium(model, capture)?;
     let activated = model.parameters.activate();
     let falloff = model.scene.falloff(&model.config);
     MediumTerm::new(surface, medium, falloff, &activated.gaussians.means, &activated.normals)

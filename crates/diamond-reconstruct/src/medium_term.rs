@@ -9,10 +9,9 @@
 //! to what leaves the medium rather than mixed with it.
 use crate::rows::{LightRows, Rows};
 use crate::visibility_cache::{LightKey, key};
-use crate::{Activated, Attribute, Model, ReconstructError, TensorFile, error, logit};
+use crate::{Activated, Attribute, Model, ReconstructError, TensorFile, error, logit, stored_medium};
 use diamond_light::{Falloff, OlatLight};
 use diamond_medium::{Attachment, Exitance, Medium, Near, Surface};
-use diamond_pathtrace::Mesh;
 use diamond_shading::{Entry, SurfelLighting};
 use glam::{Quat, Vec3};
 use std::collections::BTreeMap;
@@ -147,20 +146,11 @@ impl MediumTerm {
 
     /// Writes surface, medium and surfels of the Gaussians into a checkpoint.
     pub(crate) fn store(&self, file: &mut TensorFile) -> Result<(), ReconstructError> {
-        let mesh = self.surface.mesh();
-        let flat = |v: &[Vec3]| v.iter().flat_map(|p| p.to_array()).collect::<Vec<f32>>();
-        file.insert("medium.positions", &[mesh.positions.len(), 3], flat(&mesh.positions));
-        file.insert("medium.normals", &[mesh.positions.len(), 3], flat(mesh.normals.as_deref().unwrap_or_default()));
-        // Far below 2²⁴, so f32 holds them exactly.
-        let triangles = mesh.triangles.iter().flatten().map(|i| *i as f32).collect();
-        file.insert("medium.triangles", &[mesh.triangles.len(), 3], triangles);
+        stored_medium::store(file, "medium", &self.surface, &self.medium)?;
         let (surfels, weights) = self.attachment.to_columns();
         let shape = [self.attachment.len(), surfels.len() / self.attachment.len().max(1)];
         file.insert("medium.surfels", &shape, surfels);
         file.insert("medium.weights", &shape, weights);
-        file.metadata.insert("medium".into(), self.medium.to_toml().map_err(error::stage("medium"))?);
-        file.metadata.insert("medium_vertices".into(), mesh.positions.len().to_string());
-        file.metadata.insert("medium_triangles".into(), mesh.triangles.len().to_string());
         Ok(())
     }
 
@@ -172,19 +162,8 @@ impl MediumTerm {
         surfels: usize,
         falloff: Falloff,
     ) -> Result<Option<Self>, ReconstructError> {
-        let Some(text) = state.metadata.get("medium").cloned() else { return Ok(None) };
+        let Some((surface, medium)) = stored_medium::restore(path, state, "medium", surfels)? else { return Ok(None) };
         let fail = |detail: String| ReconstructError::Checkpoint { path: path.to_owned(), detail };
-        let medium = Medium::parse(&text).map_err(|e| fail(e.to_string()))?;
-        let (vertices, triangles): (usize, usize) =
-            (state.metadata_value(path, "medium_vertices")?, state.metadata_value(path, "medium_triangles")?);
-        let mut vectors = |name: &str| -> Result<Vec<Vec3>, ReconstructError> {
-            Ok(state.take(path, name, 3 * vertices)?.chunks_exact(3).map(Vec3::from_slice).collect())
-        };
-        let (positions, normals) = (vectors("medium.positions")?, vectors("medium.normals")?);
-        let indices = state.take(path, "medium.triangles", 3 * triangles)?;
-        let triangles = indices.chunks_exact(3).map(|t| [t[0] as u32, t[1] as u32, t[2] as u32]).collect();
-        let mesh = Mesh { positions, normals: Some(normals), triangles, ..Mesh::default() };
-        let surface = Surface::new(mesh, surfels).map_err(|e| fail(e.to_string()))?;
         let width = gaussians * Attachment::NEIGHBOURS;
         let (around, weights) =
             (state.take(path, "medium.surfels", width)?, state.take(path, "medium.weights", width)?);
@@ -361,6 +340,7 @@ impl Model {
             group.moments.first.fill(0.0);
             group.moments.second.fill(0.0);
         }
+        self.match_residual_output();
         if let Some(network) = &mut self.network {
             let head = &mut network.residual_head;
             let last = head.shape.layer_offset(head.shape.layers() - 1);
@@ -403,6 +383,7 @@ impl Model {
 mod tests {
     use super::*;
     use diamond_medium::{Coat, Transport};
+    use diamond_pathtrace::Mesh;
     use diamond_testkit::adjoint::adjoint_gap;
     use diamond_testkit::{Real, jvp};
 

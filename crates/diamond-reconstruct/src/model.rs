@@ -54,10 +54,6 @@ pub(crate) fn network_config(config: &Config) -> ResidualNetworkConfig {
         if config.residual.leak > 0.0 { Activation::LeakyRelu(config.residual.leak) } else { Activation::Relu };
     out.code_size = config.residual.codes;
     out.incident_bias = config.residual.incident_bias;
-    if config.subsurface.model.has_medium() {
-        // What is added to a medium may be less than nothing, and begins at nothing: a sigmoid would begin at ½.
-        out.residual_output = Activation::Linear;
-    }
     if config.shading.incident != crate::IncidentVariant::Learned {
         out.incident_head = None;
     }
@@ -164,6 +160,16 @@ impl Model {
         write_atomically(&folder.join(MEDIUM_FILE), text.as_bytes())
     }
 
+    /// What the network adds to a medium may be less than nothing, and begins at nothing: its last layer is then linear, where a sigmoid would begin at ½.
+    pub(crate) fn match_residual_output(&mut self) {
+        if let Some(network) = &mut self.network {
+            network.residual_head.shape.output = match self.medium {
+                Some(_) => Activation::Linear,
+                None => Activation::Sigmoid,
+            };
+        }
+    }
+
     fn load_medium(&mut self, folder: &Path) -> Result<(), ReconstructError> {
         let (medium, surface) = (folder.join(MEDIUM_FILE), folder.join(SURFACE_FILE));
         if !self.config.subsurface.model.has_medium() || !medium.exists() {
@@ -225,6 +231,7 @@ impl Model {
             model.network = Some(network);
         }
         model.load_medium(folder)?;
+        model.match_residual_output();
         Ok(model)
     }
 

@@ -9,7 +9,8 @@
 //! none of the images that were looked at beforehand had one. Facts say what a decision will save.
 use crate::channel_layout::ChannelLayout;
 use crate::{
-    Activated, CaptureFacts, Config, DensityStrategy, IncidentVariant, MetalVariant, StepPlan, StoredTransfer,
+    Activated, AugmentationSource, CaptureFacts, Config, DensityStrategy, IncidentVariant, MetalVariant, StepPlan,
+    StoredTransfer,
 };
 use diamond_shading::channel;
 use serde::Serialize;
@@ -151,6 +152,8 @@ needs! {
     input_gradient: Model, "a product with the first layer";
     /// A homogeneous medium inside the object.
     medium: Model, "a surface and a fit, some three times a run, and a look-up for every visible Gaussian";
+    /// Pictures that nobody took, to learn from.
+    made_pictures: Model, "a surface and a fit where the model has no medium, and a picture for each view and light that is made";
     /// The residual's pull toward nothing.
     residual_pull: Term, "the network, forward and backward, for some Gaussians";
     /// Latent codes.
@@ -175,6 +178,30 @@ needs! {
     unmoved_visibility: Work, "rays of lights whose visibility is old but still right";
     /// Encoding both pictures once more for the PSNR that is logged.
     own_psnr: Work, "four powers per pixel";
+}
+
+/// Whether pictures that nobody took are made, and what the capture lacks.
+fn made_pictures(config: &Config, facts: &CaptureFacts) -> Decision {
+    let settings = &config.augmentation;
+    let lacks = match facts.missing_pairs {
+        0 => "no view lacks a light of the rig".to_owned(),
+        n => format!(
+            "{n} of {} pairs of a view and a light of the rig were not photographed",
+            facts.views * facts.rig_lights
+        ),
+    };
+    let asks = settings.asks_prior(config.subsurface.model);
+    let why = match settings.source {
+        AugmentationSource::Auto if asks => "augmentation.source = \"auto\" and the model has a medium",
+        AugmentationSource::Auto => "augmentation.source = \"auto\" and the model has no medium",
+        AugmentationSource::None => "augmentation.source = \"none\"",
+        AugmentationSource::Prior => "augmentation.source = \"prior\"",
+    };
+    let lacking = facts.missing_pairs > 0 || settings.beyond_rig || settings.views > 0;
+    match settings.off_because() {
+        Some(reason) => Decision::new(false, reason),
+        None => Decision::new(asks && lacking, format!("{why}; {lacks}")),
+    }
 }
 
 impl Needs {
@@ -300,6 +327,7 @@ impl Needs {
                 true => Decision::new(true, "subsurface.model names one"),
                 false => Decision::new(false, "subsurface.model = \"mlp\": the network alone"),
             },
+            made_pictures: made_pictures(config, facts),
             residual_pull: Decision::weight("subsurface.residual_weight", config.subsurface.residual_weight)
                 .only_if(
                     config.subsurface.model.has_medium(),

@@ -11,7 +11,7 @@ use crate::random::Random;
 use crate::{ActivatedGrad, Attribute, Config, Model, ReconstructError, TrainingPair, error};
 use diamond_image::{Image, Transfer};
 use diamond_light::{OlatLight, spherical_harmonics::COEFFICIENTS};
-use diamond_losses::{Average, PhotometricOptions, Term};
+use diamond_losses::{Average, PhotometricOptions, Term, believed_photometric};
 use diamond_metrics::SsimWindow;
 use diamond_shading::pseudo_normals;
 use diamond_shading::sh_visibility::{visibilities, visibilities_pull};
@@ -20,7 +20,8 @@ use glam::Vec3;
 /// One term's name, weight and value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TermValue {
-    /// Name, as in [`diamond_losses::TERMS`] (the photometric term is listed as l1, dssim and l2).
+    /// Name, as in [`diamond_losses::TERMS`] (the photometric term is listed as l1, dssim and l2, and with `made_` before them for pictures that nobody
+    /// took).
     pub name: &'static str,
     /// Weight λ in the objective.
     pub weight: f32,
@@ -127,27 +128,37 @@ pub fn evaluate(
     let exposed = gain.map(|g| expose(&shaded.radiance, g));
     let rendered = exposed.as_ref().unwrap_or(&shaded.radiance);
     let weight = pair.weight;
-    let mut photometric = diamond_losses::photometric(rendered, &target, &options, weight).map_err(&fail)?;
-    terms.push(TermValue { name: "l1", weight: weight * (1.0 - loss.ssim), value: part(photometric.l1) });
+    let (mut photometric, names, factor) = match pair.believed {
+        None => {
+            let names = ["l1", "dssim", "l2"];
+            (diamond_losses::photometric(rendered, &target, &options, weight).map_err(&fail)?, names, 1.0)
+        }
+        Some(believed) => {
+            let believed = view.region.crop(believed).map_err(error::stage("region"))?;
+            let loss = believed_photometric(rendered, &target, &believed, &options).map_err(&fail)?;
+            (loss, ["made_l1", "made_dssim", "made_l2"], weight)
+        }
+    };
+    terms.push(TermValue { name: names[0], weight: weight * (1.0 - loss.ssim), value: part(photometric.l1) });
     if needs.window {
-        terms.push(TermValue { name: "dssim", weight: weight * loss.ssim, value: part(photometric.dssim) });
+        terms.push(TermValue { name: names[1], weight: weight * loss.ssim, value: part(photometric.dssim) });
     }
     if loss.l2 > 0.0 {
-        terms.push(TermValue { name: "l2", weight: weight * loss.l2, value: part(photometric.l2) });
+        terms.push(TermValue { name: names[2], weight: weight * loss.l2, value: part(photometric.l2) });
     }
     if let Some(gain) = gain {
         expose_pull(gain, &mut photometric.grad);
     }
     // Gradients of means over the region become those of means over the picture with the share of the batch.
     let scale = part(share);
-    add_scaled(&mut out.shaded.radiance, &photometric.grad, scale);
+    add_scaled(&mut out.shaded.radiance, &photometric.grad, scale * factor);
 
     let mut push = |term: Term, weight: f32, value: f32| terms.push(TermValue { name: term.name(), weight, value });
     if let (true, Some(mask)) = (needs.mask, mask) {
         let l = diamond_losses::mask_bce(view.opacity, mask).map_err(&fail)?;
         let value = fraction * f64::from(l.value) + (1.0 - fraction) * empty_pixel_entropy();
-        push(Term::Mask, loss.mask, value as f32);
-        add_scaled(&mut out.opacity, &l.grad, scale * loss.mask);
+        push(Term::Mask, loss.mask, factor * value as f32);
+        add_scaled(&mut out.opacity, &l.grad, scale * loss.mask * factor);
     }
     if needs.normal {
         let (pseudo, _) =

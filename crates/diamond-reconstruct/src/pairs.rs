@@ -5,6 +5,7 @@ use crate::random::{Purpose, Random};
 #[derive(Debug, Clone)]
 pub struct PairOrder {
     seed: u64,
+    purpose: Purpose,
     count: usize,
     epoch: u64,
     order: Vec<u32>,
@@ -13,14 +14,19 @@ pub struct PairOrder {
 impl PairOrder {
     /// An order over `count` pairs (at least 1).
     pub fn new(seed: u64, count: usize) -> Self {
-        let mut order = Self { seed, count: count.max(1), epoch: 0, order: Vec::new() };
+        Self::of(seed, Purpose::Pairs, count)
+    }
+
+    /// An order of its own for another purpose.
+    pub fn of(seed: u64, purpose: Purpose, count: usize) -> Self {
+        let mut order = Self { seed, purpose, count: count.max(1), epoch: 0, order: Vec::new() };
         order.shuffle(0);
         order
     }
 
     fn shuffle(&mut self, epoch: u64) {
         self.epoch = epoch;
-        self.order = Random::new(self.seed, Purpose::Pairs, epoch).permutation(self.count);
+        self.order = Random::new(self.seed, self.purpose, epoch).permutation(self.count);
     }
 
     /// The pair at a position in the endless sequence (position = step × accumulate + index in the batch).

@@ -26,6 +26,8 @@ pub enum Purpose {
     Consistency = 8,
     /// Where and how the residual is asked to be nothing.
     ResidualPull = 9,
+    /// Order of the pictures that nobody took.
+    Made = 10,
 }
 
 /// A seeded stream of random numbers.

@@ -1,4 +1,5 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
+use crate::augmentation::{MadePicture, MadePictures};
 use crate::exposure;
 use crate::pairs::PairOrder;
 use crate::photometric;
@@ -6,10 +7,12 @@ use crate::random::{Purpose, Random};
 use crate::region::Region;
 use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
+use crate::turns::{Turn, Turns};
 use crate::{
     CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Guide, Model, Needs, Neighbour, ReconstructError,
     Rendering, Scene, StepPlan, StepReport, TrainingPair,
 };
+use diamond_augment::{Frame, Source};
 use diamond_camera::Camera;
 use diamond_consistency::nearest_views;
 use diamond_dataset::{Capture, Observation};
@@ -34,7 +37,11 @@ pub struct Reconstruction {
     stereo: Vec<Option<PhotometricStereo>>,
     /// Of each training view the nearest others, where views are compared.
     neighbours: Vec<Vec<usize>>,
+    /// Pictures that nobody took.
+    made: MadePictures,
     step: u64,
+    /// The step before which a medium was last fitted.
+    medium_fitted: Option<u64>,
     /// What is to be told since it was last asked.
     notes: Vec<String>,
     /// Where the first Gaussians came from, for the log.
@@ -120,6 +127,8 @@ impl Reconstruction {
             order,
             stereo,
             neighbours,
+            made: MadePictures::default(),
+            medium_fitted: None,
             step: 0,
             notes: Vec::new(),
             initial_origin: points.origin.clone(),
@@ -130,7 +139,7 @@ impl Reconstruction {
     /// and the capture must be the ones that it was made with.
     pub fn resume(capture: Capture, config: &Config, folder: &Path) -> Result<Self, ReconstructError> {
         let path = folder.join(STATE_FILE);
-        let file = TensorFile::read(&path)?;
+        let mut file = TensorFile::read(&path)?;
         let fail = |detail: String| ReconstructError::Checkpoint { path: path.clone(), detail };
         let then: String = file.metadata_value(&path, "config")?;
         let same = |then: Config| then.deciding() == config.deciding();
@@ -158,6 +167,7 @@ impl Reconstruction {
         let origin: String = file.metadata_value(&path, "initial_origin")?;
         let points = InitialPoints { origin, ..Default::default() };
         let mut run = Self::from_points(capture, config, scene, &points, None)?;
+        run.made.restore(&path, &mut file, config.subsurface.surfels)?;
         run.engine.restore(&path, file)?;
         run.step = step;
         Ok(run)
@@ -184,6 +194,7 @@ impl Reconstruction {
         file.metadata.insert("selection".into(), selection_of(&self.capture));
         file.metadata.insert("capture_files".into(), files_of(&self.capture)?);
         file.metadata.insert("initial_origin".into(), self.initial_origin.clone());
+        self.made.store(&mut file)?;
         let path = folder.join(STATE_FILE);
         file.write(&path)?;
         Ok(path)
@@ -207,6 +218,72 @@ impl Reconstruction {
     /// What has happened since this was last asked that a user wants to know: which medium was fitted and how well.
     pub fn take_notes(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notes)
+    }
+
+    /// With another source of pictures that nobody took, beside the prior where the configuration names it: to be told before the first step, and
+    /// again after [`Reconstruction::resume`]. How many are made and what they count says `[augmentation]`.
+    pub fn with_source(mut self, source: Box<dyn Source>) -> Self {
+        self.made.sources.push(source);
+        self
+    }
+
+    /// Keeps pictures that nobody took in a folder, and reads them from there at each use; in memory unless told otherwise. To be told before they are
+    /// made. Results do not depend on it.
+    pub fn keep_pictures_in(&mut self, folder: &Path) {
+        self.made.folder = Some(folder.to_owned());
+    }
+
+    /// Whether the next step begins with making pictures that nobody took.
+    pub fn pictures_due(&self) -> bool {
+        !self.made.are_made() && self.made.wanted(&self.config) && self.turns().begun(self.position())
+    }
+
+    /// Makes the pictures that are due, if they are; the next step would do it otherwise. `progress` is told how many are done, of how many, for each source.
+    pub fn make_pictures(&mut self, progress: &mut dyn FnMut(usize, usize)) -> Result<(), ReconstructError> {
+        if !self.pictures_due() {
+            return Ok(());
+        }
+        self.fit_due_medium()?;
+        let notes = self.made.make(self.engine.model()?, &self.capture, progress)?;
+        self.notes.extend(notes);
+        Ok(())
+    }
+
+    /// Pictures that nobody took, as far as they have been made.
+    pub fn made_pictures(&self) -> &[Frame] {
+        self.made.frames()
+    }
+
+    /// Place of the next step's first image in the run's sequence of images.
+    fn position(&self) -> u64 {
+        self.step * u64::from(self.config.accumulate)
+    }
+
+    /// Whose turn it is, with the pictures that have been made.
+    fn turns(&self) -> Turns {
+        let c = &self.config;
+        Turns::new(&c.augmentation, c.steps, c.accumulate, self.pairs.len(), self.made.count())
+    }
+
+    /// Fits the medium that is due before the next step, unless that was done.
+    fn fit_due_medium(&mut self) -> Result<(), ReconstructError> {
+        let plan = StepPlan::new(&self.config, self.step);
+        if !plan.fit_medium || self.medium_fitted == Some(self.step) {
+            return Ok(());
+        }
+        self.medium_fitted = Some(self.step);
+        match crate::fit_medium(self.engine.model()?, &self.capture) {
+            Ok(medium) => {
+                self.notes.extend(medium.describe());
+                self.engine.adopt_medium(medium)
+            }
+            // Without a surface or a fit the run goes on as it is.
+            Err(ReconstructError::Unusable { detail }) => {
+                self.notes.push(format!("no medium was fitted at step {}: {detail}", self.step));
+                Ok(())
+            }
+            Err(other) => Err(other),
+        }
     }
 
     /// The configuration.
@@ -256,25 +333,21 @@ impl Reconstruction {
 
     /// One training step.
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
-        let plan = StepPlan::new(&self.config, self.step);
-        if plan.fit_medium {
-            let model = self.engine.model()?;
-            match crate::fit_medium(model, &self.capture) {
-                Ok(medium) => {
-                    self.notes.extend(medium.describe());
-                    self.engine.adopt_medium(medium)?;
-                }
-                // Without a surface or a fit the run goes on as it is.
-                Err(ReconstructError::Unusable { detail }) => {
-                    self.notes.push(format!("no medium was fitted at step {}: {detail}", self.step));
-                }
-                Err(other) => return Err(other),
-            }
-        }
+        self.fit_due_medium()?;
+        self.make_pictures(&mut |_, _| ())?;
+        let plan = StepPlan::of(&self.config, self.step, self.engine.model()?.medium.is_some());
+        let turns = self.turns();
         let batch = self.config.accumulate as u64;
-        let mut loaded: Vec<Loaded> = Vec::with_capacity(batch as usize);
+        let mut loaded: Vec<Image> = Vec::with_capacity(batch as usize);
         for k in 0..batch {
-            let pair = self.order.at(self.step * batch + k);
+            let n = match turns.at(self.step * batch + k) {
+                Turn::Photograph(n) => n,
+                Turn::Made(n) => {
+                    loaded.push(Image::Made(Box::new(self.made.at(n)?)));
+                    continue;
+                }
+            };
+            let pair = self.order.at(n);
             let (v, s) = self.pairs[pair];
             let observation = self.capture.observation(&self.capture.train[v].shots[s])?;
             let look = || Region::of_photograph(&observation.radiance, observation.mask.as_ref());
@@ -286,44 +359,83 @@ impl Reconstruction {
                 }
                 _ => None,
             };
-            loaded.push(Loaded { view: v, shot: s, image: pair, content, observation, neighbour });
+            let photograph = Photograph { view: v, shot: s, image: pair, content, observation, neighbour };
+            loaded.push(Image::Photograph(photograph));
         }
+        let step = self.step;
+        let Self { capture, config, needs, stereo, engine, .. } = &mut *self;
+        let known = Known { capture, config, needs, stereo };
         let pairs: Vec<TrainingPair<'_>> = loaded
             .iter()
-            .map(|loaded| {
-                let view = &self.capture.train[loaded.view];
-                let shot = &view.shots[loaded.shot];
-                TrainingPair {
-                    camera: &view.camera,
-                    light: &shot.light,
-                    radiance: &loaded.observation.radiance,
-                    mask: loaded.observation.mask.as_ref(),
-                    weight: shot.weight,
-                    content: loaded.content,
-                    view: loaded.view,
-                    image: loaded.image,
-                    guide: self.stereo.get(loaded.view).and_then(Option::as_ref).map(|stereo| Guide {
-                        stereo,
-                        weight: match self.needs.guided_normal.needed {
-                            true => self.config.photometric.supervise * plan.photometric,
-                            false => 0.0,
-                        },
-                        depth: self.needs.guided_depth.needed && self.config.photometric.depth,
-                    }),
-                    neighbour: loaded
-                        .neighbour
-                        .map(|(other, seed)| Neighbour { camera: &self.capture.train[other].camera, seed }),
-                }
+            .map(|image| match image {
+                Image::Photograph(photograph) => known.pair(photograph, &plan),
+                Image::Made(picture) => TrainingPair {
+                    camera: &picture.frame.target.camera,
+                    light: &picture.frame.target.light,
+                    radiance: &picture.pixels.radiance,
+                    mask: picture.pixels.mask.as_ref(),
+                    weight: known.config.augmentation.weight,
+                    believed: Some(&picture.pixels.confidence),
+                    content: picture.content,
+                    view: picture.frame.target.photograph.0,
+                    image: usize::MAX,
+                    neighbour: None,
+                    guide: None,
+                },
             })
             .collect();
-        let report = self.engine.training_step(self.step, &plan, &pairs)?;
+        let report = engine.training_step(step, &plan, &pairs)?;
         self.step += 1;
         Ok(report)
     }
 }
 
+/// What a run knows of its photographs.
+struct Known<'a> {
+    capture: &'a Capture,
+    config: &'a Config,
+    needs: &'a Needs,
+    stereo: &'a [Option<PhotometricStereo>],
+}
+
+impl Known<'_> {
+    /// A photograph as the engine sees it.
+    fn pair<'a>(&'a self, photograph: &'a Photograph, plan: &StepPlan) -> TrainingPair<'a> {
+        let view = &self.capture.train[photograph.view];
+        let shot = &view.shots[photograph.shot];
+        TrainingPair {
+            camera: &view.camera,
+            light: &shot.light,
+            radiance: &photograph.observation.radiance,
+            mask: photograph.observation.mask.as_ref(),
+            weight: shot.weight,
+            believed: None,
+            content: photograph.content,
+            view: photograph.view,
+            image: photograph.image,
+            guide: self.stereo.get(photograph.view).and_then(Option::as_ref).map(|stereo| Guide {
+                stereo,
+                weight: match self.needs.guided_normal.needed {
+                    true => self.config.photometric.supervise * plan.photometric,
+                    false => 0.0,
+                },
+                depth: self.needs.guided_depth.needed && self.config.photometric.depth,
+            }),
+            neighbour: photograph
+                .neighbour
+                .map(|(other, seed)| Neighbour { camera: &self.capture.train[other].camera, seed }),
+        }
+    }
+}
+
 /// An image of a step's batch.
-struct Loaded {
+enum Image {
+    Photograph(Photograph),
+    Made(Box<MadePicture>),
+}
+
+/// A photograph of a step's batch.
+struct Photograph {
     view: usize,
     /// Within the view.
     shot: usize,

@@ -45,8 +45,13 @@ fn log_lerp(a: f32, b: f32, t: f32) -> f32 {
 }
 
 impl StepPlan {
-    /// The plan of `step` (0-based) under `config`.
+    /// The plan of `step` (0-based) under `config`, where a medium that it names has been found.
     pub fn new(config: &Config, step: u64) -> Self {
+        Self::of(config, step, true)
+    }
+
+    /// The plan of `step` for a model that has a medium or, although `config` may name one, has none: then everything learns at its own rate.
+    pub fn of(config: &Config, step: u64, medium: bool) -> Self {
         let fraction = step as f32 / config.steps as f32;
         let r = &config.rates;
         let s = &config.shading;
@@ -80,7 +85,7 @@ impl StepPlan {
             _ => (from / d.every_steps + 1) * d.every_steps,
         };
         let m = &config.subsurface;
-        let with_medium = m.model.has_medium() && step >= at(m.from);
+        let with_medium = medium && m.model.has_medium() && step >= at(m.from);
         let (shape_rate, normal_rate, material_rate) =
             if with_medium { (m.shape_rate, m.normal_rate, m.material_rate) } else { (1.0, 1.0, 1.0) };
         let mut fits = std::iter::once(&m.from).chain(&m.refit);

@@ -45,6 +45,7 @@ fn train(model: Model, capture: &Capture, gains: &[f32]) -> Model {
             radiance: &scaled[image],
             mask: observations[image].mask.as_ref(),
             weight: 1.0,
+            believed: None,
             content: Region::of_photograph(&scaled[image], observations[image].mask.as_ref()),
             view,
             image,

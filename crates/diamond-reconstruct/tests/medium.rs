@@ -121,4 +121,11 @@ fn without_a_medium_nothing_is_fitted_and_without_a_surface_the_run_goes_on() {
         "{notes:?}"
     );
     assert!(run.model().expect("a model").medium.is_none() && run.needs().medium.needed);
+    // It goes on as if none had been asked for.
+    let mut plain = Reconstruction::new(capture(), &self::config(SubsurfaceModel::Mlp)).expect("starts");
+    finish(&mut plain);
+    assert!(
+        state(&mut run, "failed").tensors == state(&mut plain, "plain").tensors,
+        "a medium that is not there shows"
+    );
 }

@@ -1,6 +1,7 @@
 //! What a reconstruction will do before it does it: facts of the capture, what is computed and what is left out and why,
 //! when things change during the run, and what it takes. `diamond plan` prints it; a run stores it as `needs.json`.
 use crate::{MemoryPlan, SssError, open_capture};
+use diamond_augment::Lack;
 use diamond_dataset::Selection;
 use diamond_reconstruct::{ByteSize, CaptureFacts, Config, Needs, StepPlan};
 use serde::Serialize;
@@ -46,6 +47,9 @@ pub struct Estimate {
     pub network_multiplications: u64,
 }
 
+/// Views whose missing lights are told one by one.
+const SHOWN_VIEWS: usize = 8;
+
 /// A planned run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Plan {
@@ -55,6 +59,8 @@ pub struct Plan {
     pub steps: u64,
     /// The capture.
     pub capture: CaptureFacts,
+    /// What it lacks, where that is known.
+    pub lack: Option<Lack>,
     /// What is computed, and why.
     pub needs: Needs,
     /// What changes, in order.
@@ -105,7 +111,7 @@ pub fn plan_capture(options: &PlanOptions) -> Result<Plan, SssError> {
     let capture = open_capture(&options.capture, &config)?.select(&options.views, &options.lights)?;
     let facts = CaptureFacts::of(&capture)?;
     let needs = Needs::decide(&config, &facts);
-    Plan::new(&config, facts, needs)
+    Ok(Plan::new(&config, facts, needs)?.with_lack(Lack::of(&capture, &config.augmentation.wanted())))
 }
 
 /// The steps of which `f` holds, as the number of steps done at the end of the first and the last of them, and how many.
@@ -167,9 +173,15 @@ impl Plan {
             steps: config.steps,
             schedule: schedule(config),
             estimate: estimate(config, &capture, &needs),
+            lack: None,
             capture,
             needs,
         })
+    }
+
+    /// With what the capture lacks of its rig.
+    pub fn with_lack(self, lack: Lack) -> Self {
+        Self { lack: Some(lack), ..self }
     }
 
     /// The plan as JSON.
@@ -200,6 +212,20 @@ impl fmt::Display for Plan {
         writeln!(f, "  masks: {} of {} images looked at", c.masks, c.looked_at)?;
         if let Some(content) = c.content {
             writeln!(f, "  rectangle that is not empty: {:.0} % of the picture", 100.0 * content)?;
+        }
+        if let Some(lack) = &self.lack {
+            writeln!(f, "lights that were not photographed:")?;
+            writeln!(f, "  {lack}")?;
+            let made = &self.needs.made_pictures;
+            let whether = if made.needed { "they are made" } else { "they are not made" };
+            writeln!(f, "  {whether}: {}", made.reason)?;
+            for view in lack.views.iter().take(SHOWN_VIEWS) {
+                let (name, has, missing, chosen) = (&view.name, view.photographed, view.missing, view.chosen);
+                writeln!(f, "  {name}: {has} photographed, {missing} missing, {chosen} chosen")?;
+            }
+            if lack.views.len() > SHOWN_VIEWS {
+                writeln!(f, "  … and {} views more", lack.views.len() - SHOWN_VIEWS)?;
+            }
         }
         write!(f, "{}", self.needs)?;
         writeln!(f, "schedule of {} steps ({}):", self.steps, self.preset)?;

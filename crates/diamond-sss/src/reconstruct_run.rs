@@ -8,6 +8,7 @@ use crate::run_record::RunRecord;
 use crate::{
     AtOnce, Metrics, Plan, SssError, StoredCamera, StoredLight, TrainingLog, peak_bytes, shape_scores, write_report,
 };
+use diamond_augment::Lack;
 use diamond_dataset::{Capture, Selection, SelectionManifest};
 use diamond_reconstruct::{
     ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
@@ -105,6 +106,13 @@ pub enum Event<'a> {
         /// Images to learn from.
         images: usize,
     },
+    /// Pictures that nobody took are being made.
+    Made {
+        /// Pictures done.
+        done: usize,
+        /// All pictures.
+        all: usize,
+    },
     /// A step is done.
     Step {
         /// What it did.
@@ -149,8 +157,11 @@ struct Costs {
 
 const COSTS_FILE: &str = "costs.json";
 
+/// Folder in the run's in which pictures that nobody took are kept.
+const MADE_PICTURES: &str = "made";
+
 /// Files and folders that a run writes; `--force` removes these and nothing else.
-const RESULTS: [&str; 18] = [
+const RESULTS: [&str; 19] = [
     "model.ply",
     "medium.toml",
     "surface.ply",
@@ -169,6 +180,7 @@ const RESULTS: [&str; 18] = [
     "checkpoint/state.safetensors",
     "checkpoint/costs.json",
     "images",
+    MADE_PICTURES,
 ];
 
 fn clear(folder: &Path) -> Result<(), SssError> {
@@ -264,7 +276,7 @@ fn run(
     let mut peak_after = PeakAfter::default();
     peak_after.note("opening");
     std::fs::create_dir_all(folder).map_err(SssError::io(folder, "create the folder"))?;
-    for folder in [folder.to_owned(), checkpoint.clone(), folder.join("images")] {
+    for folder in [folder.to_owned(), checkpoint.clone(), folder.join("images"), folder.join(MADE_PICTURES)] {
         for path in remove_leftovers(&folder) {
             events(Event::Note(format!("{}: left by a process that was killed, removed", path.display())));
         }
@@ -283,6 +295,7 @@ fn run(
         }
         Reconstruction::new(capture.clone(), &config)?
     };
+    training.keep_pictures_in(&folder.join(MADE_PICTURES));
     peak_after.note("first Gaussians");
     let mut log = match resumed {
         true => TrainingLog::read_until(&folder.join("log.csv"), config.steps, training.steps_done()),
@@ -297,7 +310,8 @@ fn run(
     let plan = match limited {
         Some(plan) => plan,
         None => Plan::new(&config, training.facts().clone(), training.needs().clone())?,
-    };
+    }
+    .with_lack(Lack::of(&capture, &config.augmentation.wanted()));
     write_json(&folder.join("needs.json"), &plan.to_json()?)?;
     events(Event::Note(plan.summary()));
     events(Event::Started { done: training.steps_done(), steps: config.steps, images: training.pair_count() });
@@ -314,7 +328,8 @@ fn run(
         write_json(&checkpoint.join(COSTS_FILE), &spent(training))
     };
     while !training.finished() {
-        let report = match training.step() {
+        let made = training.make_pictures(&mut |done, all| events(Event::Made { done, all }));
+        let report = match made.and_then(|()| training.step()) {
             Ok(report) => report,
             Err(e @ ReconstructError::Capture(_)) => {
                 // The state is that of the last whole step. What failed is reading, and that is what is to be reported.

@@ -33,6 +33,24 @@ pub fn photometric<T: Real>(
     T::of(1.0 - lambda_ssim) * l1 + T::of(lambda_ssim) * dssim + T::of(lambda_l2) * l2
 }
 
+/// Σ wᵢ·((1 − λ)·|I − G|ᵢ + λ·(1 − SSIM)ᵢ + λ₂·(I − G)²ᵢ) / n with a weight for each pixel, SSIM with zero padding.
+pub fn believed_photometric<T: Real>(
+    image: &[T],
+    target: &[T],
+    weights: &[f64],
+    shape: crate::metrics::Shape,
+    lambda_ssim: f64,
+    lambda_l2: f64,
+) -> T {
+    let map = crate::metrics::ssim_map(image, target, shape, 0);
+    let each = (0..image.len()).map(|i| {
+        let d = image[i] - target[i];
+        let dissimilar = T::of(lambda_ssim) * (T::of(1.0) - map[i]);
+        T::of(weights[i / shape.2]) * (T::of(1.0 - lambda_ssim) * magnitude(d) + dissimilar + T::of(lambda_l2) * d * d)
+    });
+    mean(each, image.len() as f64)
+}
+
 /// Opacity clamped to `[1e-6, 1 − 1e-6]`, constant where the clamp acts.
 fn clamped<T: Real>(o: T) -> T {
     let (low, high) = (1e-6, 1.0 - 1e-6);

@@ -114,8 +114,9 @@ pub const PACKAGES: &[Package] = &[
     ),
     heavy("diamond-splat-files", 2, &["glam", "serde", "serde_json", "base64", "flate2", "ruzstd", "libm"]),
     heavy("diamond-lpips", 3, &["candle-core"]),
+    heavy("diamond-augment", 2, &["glam", "serde", "serde_json", "sha2", "safetensors", "half", "libm"]),
     heavy("diamond-synth", 3, &["glam", "rayon", "serde", "serde_json", "toml", "sha2", "safetensors", "half"]),
-    heavy("diamond-medium", 3, &["glam", "rayon", "serde", "toml", "libm"]),
+    heavy("diamond-medium", 3, &["glam", "rayon", "serde", "toml", "sha2", "libm"]),
     heavy("diamond-reconstruct", 4, &["glam", "rayon", "serde", "toml", "rand_chacha", "safetensors", "sha2", "libm"]),
     heavy("diamond-gpu", 5, &["glam", "wgpu", "naga", "bytemuck", "pollster", "libm", "rand_pcg"]),
     heavy(

@@ -40,7 +40,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         command: std::env::args().collect::<Vec<_>>().join(" "),
     };
     let mut training = Counter::new("reconstructing");
-    let mut evaluating = Counter::new("evaluating");
+    let (mut making, mut evaluating) = (Counter::new("making pictures"), Counter::new("evaluating"));
     let mut all = 0;
     let mut events = |event: Event<'_>| match event {
         Event::Note(text) => training.say(&text),
@@ -49,6 +49,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
             let from = if done > 0 { format!(", continuing after step {done}") } else { String::new() };
             training.say(&format!("{steps} steps on {images} images{from}"));
         }
+        Event::Made { done, all } => making.show(done, all),
         Event::Step { report, psnr } => {
             training.show_with(report.step + 1, all, || format!("PSNR {psnr:.2} dB, {} Gaussians", report.gaussians))
         }
@@ -58,6 +59,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
     };
     let outcome = diamond_sss::reconstruct(&options, &mut events, &interrupted);
     training.finish();
+    making.finish();
     evaluating.finish();
     let outcome = outcome?;
     if let Some(metrics) = &outcome.metrics {
