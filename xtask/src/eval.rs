@@ -11,6 +11,8 @@
 //! seeds = [0, 1, 2]
 //! regimes = ["v3-l3", "3x3", "v5-full"]
 //! reference = "neither"        # the method that differences are taken from, which comes first; the first by name where absent
+//! [settings]                   # what differs from the preset in all methods, unless the method says otherwise
+//! subsurface = { model = "mlp" }
 //! [objects]
 //! spot = "assets/captures/spot-small"
 //! [methods.neither]
@@ -67,7 +69,7 @@ impl Grid {
     /// Reads the text of a file.
     pub fn parse(text: &str) -> Result<Self, String> {
         let table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.message().to_owned())?;
-        let known = ["output", "steps", "seeds", "regimes", "reference", "objects", "methods"];
+        let known = ["output", "steps", "seeds", "regimes", "reference", "settings", "objects", "methods"];
         if let Some(key) = table.keys().find(|k| !known.contains(&k.as_str())) {
             return Err(format!("`{key}` is no key of an evaluation; expected {}", known.join(", ")));
         }
@@ -91,10 +93,20 @@ impl Grid {
             let folder = folder.as_str().ok_or(format!("`objects.{name}` must be the folder of a capture"))?;
             objects.push((name.clone(), PathBuf::from(folder)));
         }
+        let shared = match table.get("settings") {
+            Some(settings) => settings.as_table().ok_or("`[settings]` must be a table of settings")?.clone(),
+            None => toml::Table::new(),
+        };
         let mut methods = Vec::new();
-        for (name, settings) in rows("methods")? {
-            let mut settings =
-                settings.as_table().ok_or(format!("`methods.{name}` must be a table of settings"))?.clone();
+        for (name, own) in rows("methods")? {
+            let own = own.as_table().ok_or(format!("`methods.{name}` must be a table of settings"))?;
+            let mut settings = shared.clone();
+            for (key, value) in own {
+                match (settings.get_mut(key), value) {
+                    (Some(toml::Value::Table(shared)), toml::Value::Table(own)) => shared.extend(own.clone()),
+                    _ => drop(settings.insert(key.clone(), value.clone())),
+                }
+            }
             settings.entry("base").or_insert("resolved".into());
             settings.insert("name".into(), name.as_str().into());
             methods.push((name.clone(), toml::to_string(&settings).map_err(|e| e.to_string())?));
@@ -295,6 +307,21 @@ mod tests {
         assert_eq!(method["loss"]["depth_consistency"].as_float(), Some(0.3));
     }
 
+    #[test]
+    fn methods_share_settings_and_may_differ_from_them() {
+        let shared = "[settings.loss]\nmask = 0.2\ndepth_consistency = 0.1\n[objects]";
+        let grid = Grid::parse(&FILE.replace("[objects]", shared)).unwrap();
+        let of = |k: usize| grid.methods[k].1.parse::<toml::Table>().unwrap();
+        let (both, neither) = (of(0), of(1));
+        assert_eq!((both["name"].as_str(), neither["name"].as_str()), (Some("both"), Some("neither")));
+        assert_eq!(both["loss"]["mask"], neither["loss"]["mask"]);
+        assert_eq!(
+            (both["loss"]["depth_consistency"].as_float(), both["base"].as_str()),
+            (Some(0.3), Some("resolved"))
+        );
+        assert_eq!(neither["loss"]["depth_consistency"].as_float(), Some(0.1));
+    }
+
     /// The files that are shipped are read, and name captures that are here.
     #[test]
     fn shipped_evaluations_are_read() {
@@ -320,6 +347,7 @@ mod tests {
         assert!(error("[0, 7]", "[-1]").contains("seeds"));
         assert!(error("\"3x3\"", "\"../x\"").contains("regimes"));
         assert!(error("methods.both", "methods.\"a/b\"").contains("a/b"));
+        assert!(error("[objects]", "settings = 3\n[objects]").contains("settings"));
         assert!(error("spot =", "# spot =").contains("objects"));
         assert!(error("steps = 50", "reference = \"none\"").contains("reference"));
         assert!("4/4".parse::<Shard>().is_err() && "0/4".parse::<Shard>() == Ok(Shard { index: 0, of: 4 }));

@@ -120,6 +120,14 @@ impl OlatLight {
         Ok(light)
     }
 
+    /// The same light with intensity (or irradiance) 1, linear RGB: what a renderer that is linear in light is asked for.
+    pub fn of_unit_intensity(&self) -> Self {
+        match *self {
+            OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
+            OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
+        }
+    }
+
     /// `Err` where a number is not finite, an intensity is negative, or a direction is not of unit length (to 10⁻³).
     pub fn validate(&self) -> Result<(), LightError> {
         let finite = |what, v: Vec3| {

@@ -1,5 +1,5 @@
 //! The light that leaves the surfels of a surface under any lights, for a given medium.
-use crate::fit::{irradiance, normals_of, surfel_transport, white};
+use crate::fit::{irradiance, normals_of, surfel_transport};
 use crate::walk_fit::{boundary, cosines};
 use crate::{Medium, MediumError, Surface, Transport};
 use diamond_light::{Falloff, OlatLight};
@@ -64,13 +64,12 @@ impl Exitance {
         lights: &[OlatLight],
         falloff: Falloff,
     ) -> Result<Vec<Vec<f32>>, MediumError> {
-        let lamps: Vec<OlatLight> = lights.iter().map(white).collect();
+        let lamps: Vec<OlatLight> = lights.iter().map(OlatLight::of_unit_intensity).collect();
         let entering = irradiance(surface, surface.positions(), &normals_of(surface), &lamps, falloff)?;
         let (n, surfels) = (lamps.len(), surface.positions().len());
         match &self.form {
             Form::Profile { profile, transport } => {
-                let coloured: Vec<f32> = entering.iter().flat_map(|e| [*e; 3]).collect();
-                let (out, _) = transport.receivers(surface.positions())?.exitance(profile, &coloured)?;
+                let out = transport.receivers(surface.positions())?.white_exitance(profile, &entering)?;
                 let of =
                     |l: usize| (0..surfels).flat_map(|j| out[(j * n + l) * 3..][..3].iter().map(|v| v / PI)).collect();
                 Ok((0..n).map(of).collect())

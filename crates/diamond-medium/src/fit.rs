@@ -5,16 +5,15 @@
 //! by the slope of the sRGB curve between photograph and prediction, so that what is minimised is close to the error of the displayed
 //! picture; a few rounds make it consistent.
 use crate::medium::{Coat, Described, Medium, Quality, Transport};
-use crate::{Attachment, MediumError, Surface};
+use crate::{FitImage, FitPhotograph, MediumError, Surface};
 use diamond_camera::Camera;
-use diamond_image::{Image, Mask, Transfer};
+use diamond_image::Transfer;
 use diamond_light::{Falloff, OlatLight};
-use diamond_pathtrace::{Facing, NO_PRIMITIVE};
 use diamond_shading::{
-    Balance, BrdfModel, Entry, Material, NormalEquations, NormalizedDiffusion, RadialProfile, SolveOptions,
-    SurfelLighting, SurfelTransport, Surfels,
+    Balance, Entry, NormalEquations, NormalizedDiffusion, RadialProfile, SolveOptions, SurfelLighting, SurfelTransport,
+    Surfels,
 };
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -25,23 +24,6 @@ pub(crate) const FULL: f32 = 0.995;
 /// Rounds of weighting.
 const ROUNDS: usize = 3;
 
-/// One photograph.
-#[derive(Debug, Clone, Copy)]
-pub struct FitImage<'a> {
-    /// From where.
-    pub camera: &'a Camera,
-    /// Under which light.
-    pub light: &'a OlatLight,
-    /// Linear RGB over black, the camera's size.
-    pub radiance: &'a Image,
-    /// Coverage: pixels below one half are not looked at.
-    pub mask: Option<&'a Mask>,
-    /// Factor on what leaves the medium, linear RGB, where something is known of it.
-    pub tint: Option<&'a Image>,
-    /// What else is there, linear RGB: then no coat is fitted.
-    pub known: Option<&'a Image>,
-}
-
 /// How a fit goes about it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FitOptions {
@@ -49,7 +31,7 @@ pub struct FitOptions {
     pub widths: usize,
     /// Width of the widest, radii of the object.
     pub widest: f32,
-    /// At most this many pixels are looked at, spread evenly over all photographs.
+    /// About this many pixels of all photographs together are looked at; see [`FitOptions::pixels_of_each`].
     pub pixels: usize,
     /// Falloff of the lights.
     pub falloff: Falloff,
@@ -59,44 +41,35 @@ pub struct FitOptions {
     pub ridge: f64,
 }
 
+impl FitOptions {
+    /// Pixels of each of so many photographs, at least one.
+    pub fn pixels_of_each(&self, photographs: usize) -> usize {
+        (self.pixels / photographs.max(1)).max(1)
+    }
+
+    /// The pixels of a photograph that are looked at, where it is one of so many.
+    pub fn sample(
+        &self,
+        surface: &Surface,
+        image: &FitImage<'_>,
+        photographs: usize,
+    ) -> Result<FitPhotograph, MediumError> {
+        FitPhotograph::new(surface, image, self.pixels_of_each(photographs), self.falloff)
+    }
+}
+
 impl Default for FitOptions {
     fn default() -> Self {
         Self { widths: 12, widest: 1.0, pixels: 40_000, falloff: Falloff::None, unit: 1.0, ridge: 1e-6 }
     }
 }
 
-/// A pixel of a photograph that shows the surface.
-struct Seen {
-    pixel: usize,
-    position: Vec3,
-    normal: Vec3,
-    shading: Vec3,
-    toward_eye: Vec3,
-}
-
 /// One photograph's pixels and what each unknown would show there.
 pub(crate) struct Rows<'a> {
-    image: FitImage<'a>,
-    pub pixels: Vec<usize>,
+    pub photograph: &'a FitPhotograph,
     /// pixels × (shared + coats), under a light of intensity 1.
     pub values: Vec<f32>,
     pub intensity: Vec3,
-}
-
-/// Intensity or irradiance.
-pub(crate) fn intensity(light: &OlatLight) -> Vec3 {
-    match light {
-        OlatLight::Point { intensity, .. } => *intensity,
-        OlatLight::Directional { irradiance, .. } => *irradiance,
-    }
-}
-
-/// The same light with intensity 1.
-pub(crate) fn white(light: &OlatLight) -> OlatLight {
-    match *light {
-        OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
-        OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
-    }
 }
 
 pub(crate) fn key(light: &OlatLight) -> [u32; 4] {
@@ -131,23 +104,6 @@ pub(crate) fn normals_of(surface: &Surface) -> Vec<Vec3> {
     surface.patches().iter().map(|p| p.normal).collect()
 }
 
-fn seen(surface: &Surface, image: &FitImage<'_>, stride: usize) -> Vec<Seen> {
-    let (w, h) = (image.camera.intrinsics.width as usize, image.camera.intrinsics.height as usize);
-    let each = (0..w * h).into_par_iter().filter_map(|pixel| {
-        // Diagonal lines of pixels, so that a stride skips in both directions.
-        let (x, y) = (pixel % w, pixel / w);
-        if (x + 3 * y) % stride != 0 || image.mask.is_some_and(|m| m.coverage(x, y) < 0.5) {
-            return None;
-        }
-        let ray = image.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
-        let geometry = surface.geometry();
-        let hit = geometry.closest_hit(ray.origin, ray.direction, f32::INFINITY, Facing::Entering, NO_PRIMITIVE)?;
-        let shading = geometry.shading_normal(&hit);
-        Some(Seen { pixel, position: hit.position, normal: hit.normal, shading, toward_eye: -ray.direction })
-    });
-    each.collect()
-}
-
 /// What the photographs say, as columns of unknowns.
 pub(crate) struct Evidence<'a> {
     pub rows: Vec<Rows<'a>>,
@@ -157,11 +113,11 @@ pub(crate) struct Evidence<'a> {
 }
 
 /// The lights of photographs, each once, and which photograph has which.
-pub(crate) fn lights_of(images: &[FitImage<'_>]) -> (Vec<OlatLight>, Vec<usize>) {
+pub(crate) fn lights_of(photographs: &[FitPhotograph]) -> (Vec<OlatLight>, Vec<usize>) {
     let (mut lights, mut index, mut places) = (Vec::new(), Vec::new(), BTreeMap::new());
-    for image in images {
-        let place = *places.entry(key(image.light)).or_insert_with(|| {
-            lights.push(white(image.light));
+    for photograph in photographs {
+        let place = *places.entry(key(&photograph.light)).or_insert_with(|| {
+            lights.push(photograph.light.of_unit_intensity());
             lights.len() - 1
         });
         index.push(place);
@@ -182,58 +138,35 @@ pub(crate) struct Columns<'c> {
 impl<'a> Evidence<'a> {
     /// A column of light that leaves where it enters is added.
     pub(crate) fn new(
-        surface: &Surface,
-        images: &[FitImage<'a>],
+        photographs: &'a [FitPhotograph],
         columns: &Columns<'_>,
         index: &[usize],
         lights: usize,
-        options: &FitOptions,
+        unit: f32,
     ) -> Result<Self, MediumError> {
-        let total: usize =
-            images.iter().map(|i| (i.camera.intrinsics.width * i.camera.intrinsics.height) as usize).sum();
-        let covered: f64 = images
-            .iter()
-            .map(|i| i.mask.map_or(0.3, |m| f64::from(m.area() / (m.width() * m.height()).max(1) as f32)))
-            .sum::<f64>()
-            / images.len().max(1) as f64;
-        let stride = ((total as f64 * covered / options.pixels.max(1) as f64).ceil() as usize).max(1);
-        let coats = if images.iter().any(|i| i.known.is_some()) { 0 } else { COATS.len() };
-        let shared = columns.count + 1;
-        let brdf = BrdfModel::default();
-        let rows = images.iter().zip(index).map(|(image, light)| -> Result<Rows<'a>, MediumError> {
-            let places = seen(surface, image, stride);
-            let positions: Vec<Vec3> = places.iter().map(|s| s.position).collect();
-            let normals: Vec<Vec3> = places.iter().map(|s| s.normal).collect();
-            let attachment: Attachment = surface.attach(&positions, &normals);
-            let lamp = [white(image.light)];
-            let visibility = surface.visibility(&positions, &normals, &lamp);
-            let width = shared + coats;
-            let mut values = vec![0.0f32; width * places.len()];
-            values.par_chunks_exact_mut(width).zip(&places).enumerate().for_each(|(n, (row, place))| {
-                for (j, weight) in attachment.of(n) {
-                    let from = &columns.values[(j * lights + light) * columns.count..][..columns.count];
-                    row.iter_mut().zip(from).for_each(|(to, v)| *to += weight * v);
-                }
-                let factors = (columns.exit)(place.shading.dot(place.toward_eye).max(0.0));
-                row.iter_mut().zip(factors).for_each(|(v, f)| *v *= f);
-                let arriving = lamp[0].incidence(place.position, options.falloff);
-                let lit = arriving.irradiance * visibility[n];
-                row[columns.count] = lit.x * place.shading.dot(arriving.direction).max(0.0) / std::f32::consts::PI;
-                for (out, roughness) in row[shared..].iter_mut().zip(COATS) {
-                    let coat = Material { base_color: Vec3::ZERO, roughness, metalness: 0.0 };
-                    *out = brdf.reflect(&coat, place.shading, place.toward_eye, arriving.direction, lit).x;
-                }
-            });
-            let pixels = places.iter().map(|s| s.pixel).collect();
-            Ok(Rows { image: *image, pixels, values, intensity: intensity(image.light) * options.unit })
-        });
-        let rows = rows.collect::<Result<Vec<_>, _>>()?;
-        if rows.iter().all(|r| r.pixels.is_empty()) {
+        if photographs.iter().all(|p| p.pixels.is_empty()) {
             return Err(MediumError::Unusable {
                 detail: "no pixel of any photograph shows the surface; is it in the frame of the cameras?".into(),
             });
         }
-        Ok(Self { rows, shared, coats, unit: options.unit })
+        let coats = if photographs.iter().any(|p| p.has_known) { 0 } else { COATS.len() };
+        let shared = columns.count + 1;
+        let width = shared + coats;
+        let rows = photographs.iter().zip(index).map(|(photograph, light)| {
+            let mut values = vec![0.0f32; width * photograph.pixels.len()];
+            values.par_chunks_exact_mut(width).zip(&photograph.pixels).enumerate().for_each(|(n, (row, pixel))| {
+                for (j, weight) in photograph.attachment.of(n) {
+                    let from = &columns.values[(j * lights + light) * columns.count..][..columns.count];
+                    row.iter_mut().zip(from).for_each(|(to, v)| *to += weight * v);
+                }
+                let factors = (columns.exit)(pixel.cos_theta_o);
+                row.iter_mut().zip(factors).for_each(|(v, f)| *v *= f);
+                row[columns.count] = pixel.local;
+                row[shared..].iter_mut().zip(pixel.coats).for_each(|(out, v)| *out = v);
+            });
+            Rows { photograph, values, intensity: photograph.light.intensity() * unit }
+        });
+        Ok(Self { rows: rows.collect(), shared, coats, unit })
     }
 
     fn unknowns(&self) -> usize {
@@ -244,17 +177,10 @@ impl<'a> Evidence<'a> {
         self.shared + self.coats
     }
 
-    /// Channel `c` of pixel `n` of a photograph: factor of the shared columns, what is known, the photograph.
-    pub(crate) fn pixel(rows: &Rows<'_>, n: usize, c: usize) -> (f32, f32, f32) {
-        let at = 3 * rows.pixels[n] + c;
-        let of = |image: Option<&Image>, otherwise: f32| image.map_or(otherwise, |i| i.data()[at]);
-        (of(rows.image.tint, 1.0), of(rows.image.known, 0.0), rows.image.radiance.data()[at])
-    }
-
     /// What is predicted for channel `c` of pixel `n` (without what is known), from coefficients of shared columns per channel and coats.
     fn predicted(&self, rows: &Rows<'_>, x: &[f64], n: usize, c: usize) -> f32 {
         let row = &rows.values[n * self.width()..(n + 1) * self.width()];
-        let (tint, ..) = Self::pixel(rows, n, c);
+        let tint = rows.photograph.pixels[n].tint[c];
         let under: f64 = row[..self.shared].iter().zip(&x[c * self.shared..]).map(|(v, x)| f64::from(*v) * x).sum();
         let coat: f64 = row[self.shared..].iter().zip(&x[3 * self.shared..]).map(|(v, x)| f64::from(*v) * x).sum();
         rows.intensity[c] * (tint * under as f32 + coat as f32)
@@ -267,10 +193,10 @@ impl<'a> Evidence<'a> {
             .map(|rows| {
                 let mut equations = NormalEquations::new(self.unknowns());
                 let mut row = vec![0.0; self.unknowns()];
-                for n in 0..rows.pixels.len() {
+                for (n, pixel) in rows.photograph.pixels.iter().enumerate() {
                     let values = &rows.values[n * self.width()..(n + 1) * self.width()];
                     for c in 0..3 {
-                        let (tint, known, b) = Self::pixel(rows, n, c);
+                        let (tint, known, b) = (pixel.tint[c], pixel.known[c], pixel.radiance[c]);
                         if b >= FULL {
                             continue;
                         }
@@ -313,16 +239,16 @@ impl<'a> Evidence<'a> {
         // Differences of a pixel under all lights of its view, where there are several.
         let mut views: Vec<(&Camera, BTreeMap<usize, Left>)> = Vec::new();
         for rows in &self.rows {
-            let place = views.iter().position(|v| std::ptr::eq(v.0, rows.image.camera)).unwrap_or_else(|| {
-                views.push((rows.image.camera, BTreeMap::new()));
+            let place = views.iter().position(|v| *v.0 == rows.photograph.camera).unwrap_or_else(|| {
+                views.push((&rows.photograph.camera, BTreeMap::new()));
                 views.len() - 1
             });
             let view = &mut views[place].1;
-            for n in 0..rows.pixels.len() {
-                let left = view.entry(rows.pixels[n]).or_default();
+            for (n, pixel) in rows.photograph.pixels.iter().enumerate() {
+                let left = view.entry(pixel.index).or_default();
                 left.lights += 1;
                 for c in 0..3 {
-                    let (_, known, b) = Self::pixel(rows, n, c);
+                    let (known, b) = (pixel.known[c], pixel.radiance[c]);
                     let d = f64::from(encode(known + self.predicted(rows, x, n, c)) - encode(b));
                     squares += d * d;
                     truth += f64::from(encode(b)).powi(2);
@@ -381,17 +307,21 @@ pub fn offered_widths(surface: &Surface, options: &FitOptions) -> Vec<f32> {
 }
 
 /// Fits a profile and a coat to photographs.
-pub fn fit_profile(surface: &Surface, images: &[FitImage<'_>], options: &FitOptions) -> Result<Medium, MediumError> {
-    Ok(fit_profile_and_coats(surface, images, options)?.0)
+pub fn fit_profile(
+    surface: &Surface,
+    photographs: &[FitPhotograph],
+    options: &FitOptions,
+) -> Result<Medium, MediumError> {
+    Ok(fit_profile_and_coats(surface, photographs, options)?.0)
 }
 
 /// [`fit_profile`], and the scale of the coat at each of [`COATS`] (none where the rest of the light is known).
 pub(crate) fn fit_profile_and_coats(
     surface: &Surface,
-    images: &[FitImage<'_>],
+    photographs: &[FitPhotograph],
     options: &FitOptions,
 ) -> Result<(Medium, Vec<f32>), MediumError> {
-    let (lights, index) = lights_of(images);
+    let (lights, index) = lights_of(photographs);
     if lights.is_empty() {
         return Err(MediumError::Unusable { detail: "a fit needs at least one photograph".into() });
     }
@@ -403,7 +333,7 @@ pub(crate) fn fit_profile_and_coats(
     drop(basis);
     let diffuse = vec![1.0 / std::f32::consts::PI; options.widths];
     let columns = Columns { count: options.widths, values: &values, exit: &|_| diffuse.clone() };
-    let evidence = Evidence::new(surface, images, &columns, &index, lights.len(), options)?;
+    let evidence = Evidence::new(photographs, &columns, &index, lights.len(), options.unit)?;
     let (x, equations) = evidence.solve(options.ridge);
     let s = evidence.shared;
     let coats = x[3 * s..].iter().map(|v| *v as f32).collect();
@@ -468,6 +398,7 @@ mod tests {
     use super::*;
     use crate::{Exitance, fit_walk};
     use diamond_camera::{Intrinsics, Pose};
+    use diamond_image::Image;
     use diamond_pathtrace::Mesh;
 
     fn surface() -> Surface {
@@ -494,16 +425,16 @@ mod tests {
         let leaving = exitance.under(surface, &[*lamp], falloff).unwrap();
         let image = Image::new(40, 40, 3);
         let fit = FitImage { camera, light: lamp, radiance: &image, mask: None, tint: None, known: None };
-        let places = seen(surface, &fit, 1);
+        let places = fit.places(surface, 1);
         let positions: Vec<Vec3> = places.iter().map(|s| s.position).collect();
         let normals: Vec<Vec3> = places.iter().map(|s| s.normal).collect();
         let attachment = surface.attach(&positions, &normals);
-        let own = irradiance(surface, &positions, &normals, &[white(lamp)], falloff).unwrap();
+        let own = irradiance(surface, &positions, &normals, &[lamp.of_unit_intensity()], falloff).unwrap();
         let mut out = Image::new(40, 40, 3);
         for (n, place) in places.iter().enumerate() {
             let toward = exitance.toward(place.shading.dot(place.toward_eye));
             let rgb = attachment.rgb(n, &leaving[0]) * toward + medium.local() * own[n];
-            out.data_mut()[3 * place.pixel..][..3].copy_from_slice(&(rgb * intensity(lamp)).to_array());
+            out.data_mut()[3 * place.pixel..][..3].copy_from_slice(&(rgb * lamp.intensity()).to_array());
         }
         out
     }
@@ -525,7 +456,9 @@ mod tests {
             })
             .collect();
         let options = FitOptions { falloff: Falloff::InverseSquare { reference: 1.0 }, ..FitOptions::default() };
-        if walk { fit_walk(surface, &images, &options) } else { fit_profile(surface, &images, &options) }.unwrap()
+        let seen: Vec<FitPhotograph> =
+            images.iter().map(|i| options.sample(surface, i, images.len()).unwrap()).collect();
+        if walk { fit_walk(surface, &seen, &options) } else { fit_profile(surface, &seen, &options) }.unwrap()
     }
 
     fn medium(transport: Transport) -> Medium {
@@ -582,13 +515,15 @@ mod tests {
         let away = Camera { intrinsics, pose: Pose::look_at(Vec3::Z * 4.0, Vec3::Z * 9.0, Vec3::Y) };
         let (black, lamp) = (Image::new(16, 16, 3), light(Vec3::Z * 4.0));
         let image = FitImage { camera: &away, light: &lamp, radiance: &black, mask: None, tint: None, known: None };
-        for images in [&[image][..], &[]] {
-            assert!(fit_profile(&surface, images, &FitOptions::default()).is_err());
+        let options = FitOptions::default();
+        let sampled = |image: &FitImage<'_>| options.sample(&surface, image, 1).unwrap();
+        for images in [&[sampled(&image)][..], &[]] {
+            assert!(fit_profile(&surface, images, &options).is_err());
         }
         // All black photographs have the medium that returns nothing, and the user is told.
         let there = Camera { intrinsics, pose: Pose::look_at(Vec3::Z * 4.0, Vec3::ZERO, Vec3::Y) };
         let image = FitImage { camera: &there, ..image };
-        let found = fit_profile(&surface, &[image], &FitOptions::default()).unwrap();
+        let found = fit_profile(&surface, &[sampled(&image)], &options).unwrap();
         assert_eq!(found.reflectance(), Vec3::ZERO);
         assert!(found.remarks(surface.spacing()).iter().any(|r| r.contains("hardly any light")));
     }

@@ -1,5 +1,4 @@
 //! Pictures of a medium in its surface, by rays: no Gaussians, no network.
-use crate::fit::{intensity, white};
 use crate::{Attachment, Exitance, Medium, MediumError, Surface};
 use diamond_camera::Camera;
 use diamond_image::Image;
@@ -156,11 +155,11 @@ impl MediumPictures {
     pub fn radiance(&mut self, sight: &Sight, light: &OlatLight) -> Result<Image, MediumError> {
         self.prepare(&[*light])?;
         let leaving = self.kept.get(&crate::fit::key(light)).cloned().unwrap_or_default();
-        let lamp = white(light);
+        let lamp = light.of_unit_intensity();
         let visibility = self.surface.visibility(&sight.positions, &sight.normals, &[lamp]);
         let (brdf, coat, local) = (BrdfModel::default(), &self.medium.coat, self.medium.local());
         let material = Material { base_color: Vec3::ZERO, roughness: coat.roughness, metalness: 0.0 };
-        let strength = intensity(light) * self.medium.unit;
+        let strength = light.intensity() * self.medium.unit;
         let values: Vec<Vec3> = (0..sight.pixels.len())
             .into_par_iter()
             .map(|i| {

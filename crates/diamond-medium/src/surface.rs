@@ -44,9 +44,11 @@ impl Attachment {
         (self.surfels.iter().flatten().map(|j| *j as f32).collect(), self.weights.iter().flatten().copied().collect())
     }
 
-    /// What [`Attachment::to_columns`] gave; `None` where a surfel is not one of so many, or the lists do not fit.
+    /// What [`Attachment::to_columns`] gave; `None` where a surfel is not one of so many, a weight not finite or negative, or the lists do not fit.
     pub fn from_columns(surfels: &[f32], weights: &[f32], count: usize) -> Option<Self> {
-        let valid = surfels.iter().all(|j| *j >= 0.0 && (*j as usize) < count) && surfels.len() == weights.len();
+        let valid = surfels.iter().all(|j| *j >= 0.0 && (*j as usize) < count)
+            && weights.iter().all(|w| *w >= 0.0 && w.is_finite())
+            && surfels.len() == weights.len();
         let (of, rest) = surfels.as_chunks::<NEIGHBOURS>();
         valid.then_some(())?;
         rest.is_empty().then(|| Self {
@@ -81,6 +83,7 @@ impl Surface {
     /// Of a closed mesh (see [`Mesh::repair`]), cut into about `surfels` pieces. Without vertex normals it gets smooth ones. Errors where the
     /// mesh is none.
     pub fn new(mesh: Mesh, surfels: usize) -> Result<Self, MediumError> {
+        mesh.validate()?;
         let mesh = if mesh.normals.is_some() { mesh } else { mesh.with_smooth_normals() };
         let area: f32 = (0..mesh.triangles.len())
             .map(|t| {

@@ -4,11 +4,9 @@
 //! found is the reduced σ_t and albedo. For each σ_t of a coarse list, each of two boundaries, and each albedo of a list, the error is a quadratic in a
 //! gain that all channels share (photographs seldom say what a full scale of radiance is); the smallest over all of them is refined once in σ_t. The coat
 //! is that of the profile, which is fitted first.
-use crate::fit::{
-    Columns, Evidence, FitImage, FitOptions, fit_profile_and_coats, irradiance, lights_of, normals_of, slope,
-};
+use crate::fit::{Columns, Evidence, FitOptions, fit_profile_and_coats, irradiance, lights_of, normals_of, slope};
 use crate::medium::{Medium, Transport};
-use crate::{MediumError, Surface};
+use crate::{FitPhotograph, MediumError, Surface};
 use diamond_light::{Falloff, OlatLight};
 use diamond_pathtrace::{Boundary, ExitWalkOptions, ExitWalks};
 use rayon::prelude::*;
@@ -57,9 +55,9 @@ struct Candidate {
 }
 
 /// Fits a medium of random walks and a coat to photographs.
-pub fn fit_walk(surface: &Surface, images: &[FitImage<'_>], options: &FitOptions) -> Result<Medium, MediumError> {
-    let (profile, coats) = fit_profile_and_coats(surface, images, options)?;
-    let (lights, index) = lights_of(images);
+pub fn fit_walk(surface: &Surface, photographs: &[FitPhotograph], options: &FitOptions) -> Result<Medium, MediumError> {
+    let (profile, coats) = fit_profile_and_coats(surface, photographs, options)?;
+    let (lights, index) = lights_of(photographs);
     let entering = irradiance(surface, surface.positions(), &normals_of(surface), &lights, options.falloff)?;
     let cosines = cosines(surface, &lights);
     let radius = surface.radius();
@@ -67,7 +65,7 @@ pub fn fit_walk(surface: &Surface, images: &[FitImage<'_>], options: &FitOptions
         let search = ExitWalkOptions { walks: SEARCH_WALKS, max_events: SEARCH_EVENTS, seed: 1 };
         let walks =
             ExitWalks::trace(surface.geometry(), sigma_t, 0.0, boundary(ior), surface.patches(), &search, &|_| ())?;
-        let sums = sums_of(surface, images, options, &walks, &coats, (&lights, &index), (&entering, &cosines))?;
+        let sums = sums_of(photographs, options.unit, &walks, &coats, (&lights, &index), (&entering, &cosines))?;
         Ok((Candidate { sigma_t, ior, sums }, walks))
     };
     let mut tried = Vec::new();
@@ -129,9 +127,8 @@ fn choose(tried: &[Candidate]) -> (f32, [(usize, usize); 3]) {
 
 /// Σ w·r·v and Σ w·v² for each channel and albedo, with what is seen r, what is predicted v, and the weight of the displayed difference w.
 fn sums_of(
-    surface: &Surface,
-    images: &[FitImage<'_>],
-    options: &FitOptions,
+    photographs: &[FitPhotograph],
+    unit: f32,
     walks: &ExitWalks,
     coats: &[f32],
     (lights, index): (&[OlatLight], &[usize]),
@@ -141,7 +138,7 @@ fn sums_of(
     let bins = moments.exponents.len();
     let exit = |mu: f32| moments.exit_factors(mu);
     let columns = Columns { count: bins, values: &moments.values, exit: &exit };
-    let evidence = Evidence::new(surface, images, &columns, index, lights.len(), options)?;
+    let evidence = Evidence::new(photographs, &columns, index, lights.len(), unit)?;
     let powers: Vec<Vec<f32>> =
         (0..ABSORPTIONS).map(|a| moments.exponents.iter().map(|n| libm::powf(albedo(a), *n)).collect()).collect();
     let parts: Vec<Vec<[f64; 2]>> = evidence
@@ -149,13 +146,13 @@ fn sums_of(
         .par_iter()
         .map(|rows| {
             let mut sums = vec![[0.0f64; 2]; 3 * ABSORPTIONS];
-            for n in 0..rows.pixels.len() {
+            for (n, pixel) in rows.photograph.pixels.iter().enumerate() {
                 let row = &rows.values[n * evidence.width()..(n + 1) * evidence.width()];
                 let coat: f32 = row[evidence.shared..].iter().zip(coats).map(|(v, s)| v * s).sum();
                 let grey: Vec<f32> =
                     powers.iter().map(|p| row[..bins].iter().zip(p).map(|(v, p)| v * p).sum()).collect();
                 for c in 0..3 {
-                    let (tint, known, b) = Evidence::pixel(rows, n, c);
+                    let (tint, known, b) = (pixel.tint[c], pixel.known[c], pixel.radiance[c]);
                     if b >= crate::fit::FULL {
                         continue;
                     }

@@ -6,9 +6,10 @@ use crate::medium_term::{MediumTerm, TINT};
 use crate::{Config, InitialSource, Model, ReconstructError, Renderer, error};
 use diamond_dataset::{Capture, Observation, Shot, View};
 use diamond_image::Image;
+use diamond_light::OlatLight;
 use diamond_medium::{
-    CarveOptions, FitImage, FitOptions, Medium, OrientedPoint, Prior, PriorOptions, Silhouette, Surface, carve,
-    fit_profile, fit_walk, hull_bounds, outward_normals,
+    CarveOptions, FitImage, FitOptions, FitPhotograph, Medium, MediumError, OrientedPoint, Prior, PriorOptions,
+    Silhouette, Surface, carve, fit_profile, fit_walk, hull_bounds, outward_normals,
 };
 use diamond_pathtrace::RepairOptions;
 use diamond_shading::pseudo_normals;
@@ -19,7 +20,7 @@ use std::sync::Arc;
 
 /// Views from which the surface is looked at, at most.
 const SHAPE_VIEWS: usize = 48;
-/// Points from all views together, about.
+/// Points from all views together, at most about.
 const SHAPE_POINTS: usize = 200_000;
 /// Opacity above which a pixel shows the surface.
 const OPAQUE: f32 = 0.7;
@@ -68,16 +69,15 @@ fn cloud(capture: &Capture, config: &Config) -> Result<(Vec<OrientedPoint>, f32)
 /// The surface of a model, as the training views show it.
 pub fn surface_of(model: &Model, capture: &Capture) -> Result<Surface, ReconstructError> {
     if let Some(path) = &model.config.subsurface.surface {
-        return given(path, model.config.subsurface.surfels);
+        // An absolute path stays what it is.
+        let beside = capture.root.join(path);
+        return given(if beside.exists() { &beside } else { path }, model.config.subsurface.surfels);
     }
     let renderer = Renderer::new(model);
     let views: Vec<&View> = spread(&capture.train, SHAPE_VIEWS).collect();
     let (mut points, spacing) = cloud(capture, &model.config)?;
     let pixel_weight = if points.is_empty() { 1.0 } else { PIXEL_WEIGHT };
     let mut silhouettes = Vec::new();
-    let pixels: usize = views.iter().map(|v| (v.camera.intrinsics.width * v.camera.intrinsics.height) as usize).sum();
-    // The object fills a part of the picture only.
-    let stride = ((0.3 * pixels as f32 / SHAPE_POINTS as f32).sqrt().ceil() as usize).max(1);
     for view in &views {
         let camera = &view.camera;
         let shape = renderer.shape(camera)?;
@@ -86,6 +86,8 @@ pub fn surface_of(model: &Model, capture: &Capture) -> Result<Surface, Reconstru
         let depth: Vec<f32> = each.map(|(d, o)| if *o > 0.0 { d / o } else { 0.0 }).collect();
         let depth = Image::from_vec(w, h, 1, depth).map_err(error::stage("surface"))?;
         let (normals, _) = pseudo_normals(camera, &depth, &shape.opacity).map_err(error::stage("surface"))?;
+        let shown = shape.opacity.data().iter().filter(|o| **o >= OPAQUE).count();
+        let stride = ((shown * views.len()) as f32 / SHAPE_POINTS as f32).sqrt().ceil().max(1.0) as usize;
         for y in (0..h).step_by(stride) {
             for x in (0..w).step_by(stride) {
                 let Some(normal) = Vec3::from_slice(normals.pixel(x, y)).try_normalize() else { continue };
@@ -145,52 +147,66 @@ fn given(path: &Path, surfels: usize) -> Result<Surface, ReconstructError> {
     Surface::new(repaired.0, surfels).map_err(|e| fail(e.to_string()))
 }
 
-/// Photographs of a capture that a medium is compared with, and what they show.
-struct Photographs<'c> {
-    chosen: Vec<(&'c View, &'c Shot)>,
-    observations: Vec<Arc<Observation>>,
+/// A photograph that a medium is compared with.
+struct Taken<'a> {
+    view: &'a View,
+    shot: &'a Shot,
+    /// Times the photograph's gain: light is linear.
+    light: OlatLight,
 }
 
-impl<'c> Photographs<'c> {
-    fn of(capture: &'c Capture) -> Result<Self, ReconstructError> {
-        let shots: Vec<(&View, &Shot)> =
-            capture.train.iter().flat_map(|v| v.shots.iter().map(move |s| (v, s))).collect();
-        let chosen: Vec<(&View, &Shot)> = spread(&shots, FIT_IMAGES).copied().collect();
-        let observations = chosen.iter().map(|(_, shot)| capture.observation(shot)).collect::<Result<_, _>>()?;
-        Ok(Self { chosen, observations })
+impl<'a> Taken<'a> {
+    /// Training photographs, spread over all of them, each under its gain so far.
+    fn of(model: &Model, capture: &'a Capture) -> Vec<Self> {
+        let views = capture.train.iter().enumerate();
+        let shots: Vec<(usize, &View, &Shot)> =
+            views.flat_map(|(v, view)| view.shots.iter().map(move |s| (v, view, s))).collect();
+        let numbered: Vec<_> = shots.into_iter().enumerate().collect();
+        let chosen = spread(&numbered, FIT_IMAGES);
+        chosen
+            .map(|&(image, (v, view, shot))| {
+                let gain = model.exposure.index(model.config.exposure.mode, v, image);
+                Self { view, shot, light: shot.light.scaled(gain.map_or(Vec3::ONE, |i| model.exposure.gain(i))) }
+            })
+            .collect()
     }
 
-    /// With a factor for each photograph on what leaves the medium, where there are some.
-    fn images<'a>(&'a self, tints: &'a [Arc<Image>]) -> Vec<FitImage<'a>> {
-        let each = self.chosen.iter().zip(&self.observations).enumerate();
-        each.map(|(i, ((view, shot), observation))| FitImage {
-            camera: &view.camera,
-            light: &shot.light,
+    /// What it shows, with a factor on what leaves the medium where there is one.
+    fn image(&'a self, observation: &'a Observation, tint: Option<&'a Image>) -> FitImage<'a> {
+        FitImage {
+            camera: &self.view.camera,
+            light: &self.light,
             radiance: &observation.radiance,
             mask: observation.mask.as_ref(),
-            tint: tints.get(i).map(|t| t.as_ref()),
+            tint,
             known: None,
-        })
-        .collect()
+        }
     }
 }
 
-/// Fits a medium within `surface` to the training photographs.
+/// Fits a medium within `surface` to the training photographs, each under its gain so far.
 pub fn medium_of(model: &Model, capture: &Capture, surface: &Surface) -> Result<Medium, ReconstructError> {
-    let photographs = Photographs::of(capture)?;
-    let tints = match model.medium {
-        Some(_) => tint_maps(model, &photographs.chosen)?,
-        None => Vec::new(),
-    };
-    let images = photographs.images(&tints);
+    let chosen = Taken::of(model, capture);
     let options = FitOptions {
         widths: model.config.subsurface.widths,
         falloff: model.scene.falloff(&model.config),
         unit: model.scene.light_scale,
         ..FitOptions::default()
     };
+    let unusable = |e: MediumError| ReconstructError::Unusable { detail: e.to_string() };
+    let mut seen: Vec<FitPhotograph> = Vec::with_capacity(chosen.len());
+    let mut tint = None;
+    for (i, taken) in chosen.iter().enumerate() {
+        // Neighbouring photographs of one view share what its tints look like.
+        if model.medium.is_some() && (i == 0 || !std::ptr::eq(taken.view, chosen[i - 1].view)) {
+            tint = Some(tint_map(model, taken)?);
+        }
+        let observation = capture.observation(taken.shot)?;
+        let image = taken.image(&observation, tint.as_ref());
+        seen.push(options.sample(surface, &image, chosen.len()).map_err(unusable)?);
+    }
     let fit = if model.config.subsurface.model.walks() { fit_walk } else { fit_profile };
-    fit(surface, &images, &options).map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
+    fit(surface, &seen, &options).map_err(unusable)
 }
 
 /// The physical prior as a source of pictures: a surface with a medium, and its error on the training photographs.
@@ -202,24 +218,18 @@ pub(crate) fn prior_of(
 ) -> Result<Prior, ReconstructError> {
     let settings = &model.config.augmentation;
     let options = PriorOptions { half_error: settings.half_error, ..PriorOptions::default() };
-    let (photographs, falloff) = (Photographs::of(capture)?, model.scene.falloff(&model.config));
-    Prior::new(surface, medium, falloff, &photographs.images(&[]), options)
+    let (chosen, falloff) = (Taken::of(model, capture), model.scene.falloff(&model.config));
+    let observations: Vec<Arc<Observation>> =
+        chosen.iter().map(|taken| capture.observation(taken.shot)).collect::<Result<_, _>>()?;
+    let images: Vec<FitImage<'_>> = chosen.iter().zip(&observations).map(|(t, o)| t.image(o, None)).collect();
+    Prior::new(surface, medium, falloff, &images, options)
         .map_err(|e| ReconstructError::Unusable { detail: e.to_string() })
 }
 
-/// Tints as the views show them; neighbouring photographs of one view share theirs.
-fn tint_maps(model: &Model, chosen: &[(&View, &Shot)]) -> Result<Vec<Arc<Image>>, ReconstructError> {
-    let renderer = Renderer::new(model);
-    let mut out: Vec<Arc<Image>> = Vec::new();
-    for (i, (view, shot)) in chosen.iter().enumerate() {
-        if i > 0 && std::ptr::eq(*view, chosen[i - 1].0) {
-            out.push(Arc::clone(&out[i - 1]));
-            continue;
-        }
-        let rendering = renderer.renderings(&view.camera, &[shot.light])?;
-        out.push(Arc::new(rendering[0].maps.base_color.map(|v| TINT * v)));
-    }
-    Ok(out)
+/// Tints as a view shows them.
+fn tint_map(model: &Model, taken: &Taken<'_>) -> Result<Image, ReconstructError> {
+    let rendering = Renderer::new(model).renderings(&taken.view.camera, &[taken.light])?;
+    Ok(rendering[0].maps.base_color.map(|v| TINT * v))
 }
 
 /// Surface and medium of a model as it stands; `Unusable` where there is no surface, or light in the object is not what a medium of this kind explains.

@@ -244,7 +244,7 @@ impl MediumTerm {
         tints: Vec<Vec3>,
     ) -> Result<MediumRows, ReconstructError> {
         let leaving = &self.leaving(&[*light])?[0];
-        let lamp = white(light);
+        let lamp = light.of_unit_intensity();
         let untinted = (0..rows.len()).map(|row| {
             let place = MediumPlace {
                 gaussian: rows.visible[row] as usize,
@@ -281,7 +281,7 @@ impl MediumTerm {
         medium: &MediumRows,
         d: &[f32],
     ) -> Result<MediumRowsGrad, ReconstructError> {
-        let lamp = [white(light)];
+        let lamp = [light.of_unit_intensity()];
         let local = self.local();
         let rgb = |row: usize| Vec3::from_slice(&d[3 * row..3 * row + 3]);
         let base_color = (0..rows.len()).map(|row| rgb(row) * medium.untinted[row] * TINT).collect();
@@ -298,14 +298,6 @@ impl MediumTerm {
     }
 }
 
-/// The same light with intensity 1.
-pub(crate) fn white(light: &OlatLight) -> OlatLight {
-    match *light {
-        OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
-        OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
-    }
-}
-
 /// Thickness of a new Gaussian over its standard deviation along the surface.
 const SEED_FLATNESS: f32 = 0.2;
 /// Its opacity.
@@ -314,7 +306,7 @@ const SEED_OPACITY: f32 = 0.9;
 impl Model {
     /// Takes a medium in. The first one takes over from what has been learned of the light so far: base colours become neutral tints,
     /// subsurfaceness whole, roughness the coat's, network and transfer vectors silent; and all of that learns anew. With `seeds` above 0 the
-    /// Gaussians are also replaced by about so many flat ones on the surface. Returns where each Gaussian comes from, if they are others now.
+    /// Gaussians are also replaced by about so many flat ones on the surface, at most `density.max_gaussians`. Returns where each Gaussian comes from, if they are others now.
     pub(crate) fn adopt_medium(
         &mut self,
         term: MediumTerm,
@@ -356,7 +348,13 @@ impl Model {
     fn seed_from_surface(&mut self, seeds: usize) -> Result<Vec<(u32, bool)>, ReconstructError> {
         let (inset, seed_width) = (self.config.subsurface.inset, self.config.subsurface.seed_width);
         let Some(term) = &mut self.medium else { return Ok(Vec::new()) };
-        let pieces = term.surface.cut(seeds).map_err(error::stage("surface"))?;
+        let most = self.config.density.max_gaussians;
+        let mut wanted = seeds.min(most);
+        let mut pieces = term.surface.cut(wanted).map_err(error::stage("surface"))?;
+        while pieces.len() > most && wanted > 1 {
+            wanted = (wanted * most / pieces.len()).min(wanted - 1).max(1);
+            pieces = term.surface.cut(wanted).map_err(error::stage("surface"))?;
+        }
         let means = self.parameters.activate().gaussians.means;
         let spacing = term.surface.spacing();
         let near = Near::new(&means, 2.0 * spacing);

@@ -255,6 +255,7 @@ mod tests {
     #[test]
     fn what_cannot_be_used_is_left_out() {
         let mut config = Config::preset("resolved").unwrap();
+        config.subsurface.model = crate::SubsurfaceModel::Mlp;
         config.photometric = crate::Photometric { initial: true, supervise: 0.1, until: 0.5, depth: true };
         let facts = |most_view_images| CaptureFacts { views: 3, most_view_images, ..Default::default() };
         let two = Needs::decide(&config, &facts(2));

@@ -9,7 +9,7 @@
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
 use crate::forward::{Settings, raster_config};
-use crate::medium_term::{MediumPlace, white};
+use crate::medium_term::MediumPlace;
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
@@ -523,7 +523,7 @@ impl ViewHalf {
         lights: &[(OlatLight, &[f32])],
         features: &mut Vec<f32>,
     ) -> Result<(), ReconstructError> {
-        let lamps: Vec<OlatLight> = lights.iter().map(|(light, _)| white(light)).collect();
+        let lamps: Vec<OlatLight> = lights.iter().map(|(light, _)| light.of_unit_intensity()).collect();
         let medium = medium.filter(|_| !self.tints.is_empty());
         let leaving = medium.map_or(Ok(Vec::new()), |medium| medium.leaving(&lamps))?;
         let width = self.channels.per_light * lights.len();

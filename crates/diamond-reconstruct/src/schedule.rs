@@ -125,9 +125,15 @@ impl StepPlan {
 mod tests {
     use super::*;
 
+    fn without_a_medium() -> Config {
+        let mut config = Config::preset("resolved").unwrap();
+        config.subsurface.model = crate::SubsurfaceModel::Mlp;
+        config
+    }
+
     #[test]
     fn rates_fall_and_rounds_end() {
-        let mut config = Config::preset("resolved").unwrap();
+        let mut config = without_a_medium();
         config.steps = 1000;
         config.rates.mean_decay = 1.0;
         let first = StepPlan::new(&config, 0);
@@ -143,6 +149,19 @@ mod tests {
         assert!(StepPlan::new(&config, 10).roughness_frozen && !StepPlan::new(&config, 500).roughness_frozen);
     }
 
+    /// A run that found no medium learns as one that asked for none.
+    #[test]
+    fn rates_fall_only_beside_a_medium() {
+        let (mut asked, without) = (Config::preset("resolved").unwrap(), without_a_medium());
+        asked.subsurface.from = 0.1;
+        for step in [0, 600, 1500, 9999] {
+            let plain = StepPlan::new(&without, step);
+            assert_eq!(StepPlan { fit_medium: false, ..StepPlan::of(&asked, step, false) }, plain);
+            let planned = StepPlan::new(&asked, step);
+            assert_eq!(planned.normal_factor < plain.normal_factor, step >= 1000, "{step}");
+        }
+    }
+
     #[test]
     fn gains_have_a_window() {
         let mut config = Config::preset("resolved").unwrap();
@@ -153,7 +172,7 @@ mod tests {
 
     #[test]
     fn a_frozen_count_stops_all_but_relocation() {
-        let mut config = Config::preset("resolved").unwrap();
+        let mut config = without_a_medium();
         config.steps = 1000;
         config.density.until = 1.0;
         config.density.freeze_count = 0.5;
@@ -173,7 +192,7 @@ mod tests {
 
     #[test]
     fn views_are_compared_after_the_first_round_and_with_the_weight_of_all_steps() {
-        let mut config = Config::preset("resolved").unwrap();
+        let mut config = without_a_medium();
         config.steps = 1000;
         (config.consistency.every_steps, config.consistency.until) = (5, 0.9);
         let factors = |c: &Config| (0..1000).map(|s| StepPlan::new(c, s).consistency).collect::<Vec<f32>>();

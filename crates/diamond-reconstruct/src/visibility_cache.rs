@@ -10,7 +10,7 @@
 //! needed, it is not refitted from step to step: the order in which a ray meets the Gaussians, and with it the last bit
 //! of its transmittance, would depend on when the tree was first built, and an interrupted run could not go on with the
 //! same bits.
-use crate::config::Visibility;
+use crate::Visibility;
 use crate::{ReconstructError, TensorFile, error};
 use diamond_light::OlatLight;
 use diamond_splat::{GaussianBvh, Gaussians, LightGrid, VisibilityConfig};

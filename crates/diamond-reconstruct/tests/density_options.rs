@@ -13,6 +13,7 @@ fn capture(views: usize, lights: usize) -> Capture {
 fn short(steps: u64) -> Config {
     let mut config = Config::preset("resolved").expect("a preset");
     config.steps = steps;
+    config.subsurface.model = diamond_reconstruct::SubsurfaceModel::Mlp;
     config.initial.count = 500;
     config.density.every_steps = 5;
     config.density.from = 0.1;

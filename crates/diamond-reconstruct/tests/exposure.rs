@@ -17,6 +17,7 @@ fn capture(views: usize, lights: usize) -> Capture {
 fn config(mode: ExposureMode, steps: u64) -> Config {
     let mut config = Config::preset("resolved").expect("a preset");
     config.steps = steps;
+    config.subsurface.model = diamond_reconstruct::SubsurfaceModel::Mlp;
     config.initial.count = 1000;
     config.exposure.mode = mode;
     config.density.strategy = diamond_reconstruct::DensityStrategy::None;

@@ -2,7 +2,10 @@
 //! and that a run whose surface cannot be found goes on.
 use diamond_dataset::{Capture, OpenOptions, Selection};
 use diamond_light::OlatLight;
-use diamond_reconstruct::{Config, Model, Reconstruction, Renderer, SubsurfaceModel, TensorFile};
+use diamond_medium::Transport;
+use diamond_reconstruct::{
+    Config, ExposureMode, Model, Reconstruction, Renderer, SubsurfaceModel, TensorFile, medium_of, surface_of,
+};
 
 fn capture() -> Capture {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/captures/spot-small");
@@ -97,6 +100,29 @@ fn pictures_are_linear_in_the_light_and_survive_the_files() {
             assert!((2.0 * one - two).abs() <= 1e-6 * largest, "{one} {two}");
         }
         assert!(pictures[0].data() == again[0].data(), "the model that was read shows something else");
+    }
+}
+
+/// Photographs that are taken to be twice as bright as the light was show a medium that sends out half as much.
+#[test]
+fn a_fit_knows_the_gains_of_photographs() {
+    let mut config = config(SubsurfaceModel::Profile);
+    config.exposure.mode = ExposureMode::PerImage;
+    let run = Reconstruction::new(capture(), &config);
+    let mut model = run.expect("starts").model().expect("a model").clone();
+    let surface = surface_of(&model, &capture()).expect("a surface");
+    let mut fitted = |gain: f32| {
+        model.exposure.log_gains.fill(gain.ln());
+        match medium_of(&model, &capture(), &surface).expect("a medium").transport {
+            Transport::Profile { weights, local, .. } => [weights, vec![local]].concat().concat(),
+            Transport::Walk { .. } => panic!("a profile was asked for"),
+        }
+    };
+    let (plain, bright) = (fitted(1.0), fitted(2.0));
+    let largest = plain.iter().copied().fold(0.0, f32::max);
+    assert!(largest > 0.1);
+    for (a, b) in plain.iter().zip(&bright) {
+        assert!((a - 2.0 * b).abs() <= 1e-3 * largest, "{plain:?} {bright:?}");
     }
 }
 

@@ -18,6 +18,7 @@ fn capture() -> Capture {
 fn short(preset: &str) -> Config {
     let mut config = Config::preset(preset).expect("a preset");
     config.steps = 40;
+    config.subsurface.model = diamond_reconstruct::SubsurfaceModel::Mlp;
     config.initial.count = 500;
     config.density.strategy = DensityStrategy::None;
     config.visibility.every_steps = 5;
@@ -67,6 +68,10 @@ fn a_step_agrees_with_everything_computed() {
     change("no metal", &|c| c.shading.metal = MetalVariant::No);
     change("no subsurface", &|c| (c.residual.network, c.residual.transfer) = (false, false));
     change("no shadows", &|c| c.shading.surface_visibility = false);
+    change("with a medium", &|c| {
+        c.subsurface.model = diamond_reconstruct::SubsurfaceModel::ProfileMlp;
+        (c.subsurface.surfels, c.subsurface.seeds, c.subsurface.resolution, c.subsurface.widths) = (500, 800, 28, 6);
+    });
     change("no SSIM", &|c| c.loss.ssim = 0.0);
     change("l2 and enhancement in linear", &|c| {
         (c.loss.l2, c.loss.enhancement, c.loss.space) = (0.5, 0.1, diamond_reconstruct::StoredTransfer::Linear);

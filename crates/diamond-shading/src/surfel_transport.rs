@@ -271,6 +271,42 @@ impl<'a> Receivers<'a> {
         Ok((0..self.arrivals.len()).map(matrix).collect())
     }
 
+    /// [`Receivers::exitance`] of white light, which has one column for each light instead of three: receivers × lights × 3, from scalar
+    /// irradiance of surfels × lights. Up to three times as fast.
+    /// `[eq:surfel-transport]`
+    pub fn white_exitance(&self, profile: &RadialProfile, irradiance: &[f32]) -> Result<Vec<f32>, ShadingError> {
+        let lights = self.columns(irradiance)?;
+        self.check_widths_of(profile, lights)?;
+        let mut out = vec![0.0f32; self.positions.len() * lights * 3];
+        for (start, length) in groups(lights) {
+            let parts = map_chunks(self.arrivals.len(), |k| {
+                let leaving = &self.transport.gaussians[k].leaving;
+                summed(&self.arrivals[k].0, leaving, irradiance, lights, (start, length))
+            });
+            for (k, part) in parts.iter().enumerate() {
+                let weight = profile.weights[k].to_array();
+                for (i, factor) in self.arrivals[k].1.iter().enumerate() {
+                    let to = &mut out[(i * lights + start) * 3..][..3 * length];
+                    for (to, v) in to.as_chunks_mut::<3>().0.iter_mut().zip(&part[i * length..]) {
+                        (0..3).for_each(|c| to[c] += weight[c] * factor * v);
+                    }
+                }
+            }
+        }
+        Ok(out)
+    }
+
+    fn check_widths_of(&self, profile: &RadialProfile, columns: usize) -> Result<(), ShadingError> {
+        if profile.widths() == self.transport.widths {
+            return Ok(());
+        }
+        Err(ShadingError::Shape {
+            what: "exitance under a profile",
+            expected: format!("the widths {:?}", self.transport.widths),
+            found: format!("{columns} columns and the widths {:?}", profile.widths()),
+        })
+    }
+
     /// Radiosity under a profile whose widths are the transport's: receivers × lights × 3, from irradiance of surfels × lights × 3.
     /// Radiance of an ideally diffuse exit is that over π. The pullback takes a cotangent of the result.
     /// `[eq:surfel-transport]`
@@ -280,11 +316,12 @@ impl<'a> Receivers<'a> {
         irradiance: &'p [f32],
     ) -> Result<(Vec<f32>, ExitancePullback<'p>), ShadingError> {
         let columns = self.columns(irradiance)?;
-        if !columns.is_multiple_of(3) || profile.widths() != self.transport.widths {
+        self.check_widths_of(profile, columns)?;
+        if !columns.is_multiple_of(3) {
             return Err(ShadingError::Shape {
                 what: "exitance under a profile",
-                expected: format!("three columns for each light and the widths {:?}", self.transport.widths),
-                found: format!("{columns} columns and the widths {:?}", profile.widths()),
+                expected: "three columns for each light".into(),
+                found: format!("{columns} columns"),
             });
         }
         let mut out = vec![0.0f32; self.positions.len() * columns];

@@ -239,6 +239,25 @@ fn threads_do_not_change_bits() {
     assert_eq!(run(1), run(5));
 }
 
+/// White light in one column has the bits of the same light in three, for few lights and for many.
+#[test]
+fn white_light_is_three_equal_channels() {
+    let (surfels, _) = ellipsoid(90, Vec3::new(1.0, 0.7, 0.4));
+    let transport = transport(&surfels, Balance::Plain);
+    let receivers = transport.receivers(&surfels.positions).unwrap();
+    let profile = profile(&(0..12).map(|i| 0.05 + 0.03 * i as f32).collect::<Vec<_>>());
+    for lights in [1, 5, 19] {
+        let white: Vec<f32> = (0..90 * lights).map(|i| (i * 37 % 23) as f32).collect();
+        let coloured: Vec<f32> = white.iter().flat_map(|e| [*e; 3]).collect();
+        let found = receivers.white_exitance(&profile, &white).unwrap();
+        assert_eq!(found, exitance(&receivers, &profile, &coloured), "{lights}");
+        assert!(found.chunks_exact(3).any(|rgb| rgb[0] < 0.9 * rgb[2]));
+    }
+    let other = RadialProfile::new(vec![0.1], vec![Vec3::ONE]).unwrap();
+    assert!(receivers.white_exitance(&other, &[1.0; 90]).is_err());
+    assert!(receivers.white_exitance(&profile, &[1.0; 91]).is_err());
+}
+
 #[test]
 fn what_cannot_be_transported_is_refused() {
     let (surfels, _) = ellipsoid(20, Vec3::ONE);

@@ -37,7 +37,7 @@ fn main() {
         let config = dir.join("memory.toml");
         let text = format!(
             "base = \"{preset}\"\nname = \"memory\"\n[initial]\ncount = {gaussians}\nhull_resolution = 192\n\
-             [density]\nmax_gaussians = {gaussians}\nstrategy = \"none\"\n"
+             [density]\nmax_gaussians = {gaussians}\nstrategy = \"none\"\n[subsurface]\nseeds = 0\n"
         );
         std::fs::write(&config, text).unwrap();
         let words = ["reconstruct", "capture", "-o", "out", "--preset", "memory.toml", "--steps", "30"];

@@ -141,7 +141,7 @@ impl Prior {
 
     /// Features of some shots of a view.
     fn features(&self, capture: &Capture, view: &View, shots: &[&Shot]) -> Result<Vec<Features>, Failure> {
-        let lights: Vec<OlatLight> = shots.iter().map(|s| white(&s.light)).collect();
+        let lights: Vec<OlatLight> = shots.iter().map(|s| s.light.of_unit_intensity()).collect();
         let samples = seen(&self.geometry, &view.camera, self.samples);
         let positions: Vec<Vec3> = samples.iter().map(|s| s.position).collect();
         let normals: Vec<Vec3> = samples.iter().map(|s| s.normal).collect();
@@ -179,7 +179,7 @@ impl Prior {
             out.push(Features {
                 pixels: pixels.clone(),
                 values,
-                intensity: intensity(&shot.light) * self.exposure,
+                intensity: shot.light.intensity() * self.exposure,
                 radiance: observation.radiance.clone(),
                 display: observation.display.clone(),
                 name: shot.name.clone(),
@@ -233,20 +233,6 @@ fn slope(a: f32, b: f32) -> f32 {
         return Transfer::Srgb.encode_pull(0.5 * (a + b), 1.0);
     }
     (Transfer::Srgb.encode(a) - Transfer::Srgb.encode(b)) / (a - b)
-}
-
-fn intensity(light: &OlatLight) -> Vec3 {
-    match light {
-        OlatLight::Point { intensity, .. } => *intensity,
-        OlatLight::Directional { irradiance, .. } => *irradiance,
-    }
-}
-
-fn white(light: &OlatLight) -> OlatLight {
-    match *light {
-        OlatLight::Point { position, .. } => OlatLight::Point { position, intensity: Vec3::ONE },
-        OlatLight::Directional { direction, .. } => OlatLight::Directional { direction, irradiance: Vec3::ONE },
-    }
 }
 
 /// A place that a camera ray meets.

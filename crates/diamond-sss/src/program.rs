@@ -50,8 +50,8 @@ fn print(text: &str) {
 fn run(command: Command) -> Result<(), SssError> {
     match command {
         Command::Reconstruct(arguments) => reconstruct::run(arguments),
-        Command::Synth { recipe, changes, output, members, contact_sheet, shards } => {
-            synth::run(&synth::Wish { recipe, changes, output, members, contact_sheet, shards })
+        Command::Synth { recipe, changes, output, members, contact_sheet, mesh, shards } => {
+            synth::run(&synth::Wish { recipe, changes, output, members, contact_sheet, mesh, shards })
         }
         Command::Shards { captures, output, shard_size } => synth::shards(&captures, &output, shard_size.0),
         Command::Evaluate { dir, capture, save_images, instruction_set } => {

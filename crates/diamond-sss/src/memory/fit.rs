@@ -128,7 +128,10 @@ impl MemoryPlan {
     /// Plans a run under `config.memory_limit`. Depends on the configuration and the facts alone.
     pub fn new(config: &Config, facts: &CaptureFacts, needs: &Needs) -> Result<Self, Box<Refused>> {
         let run = Run { config, facts, needs };
-        let first = config.initial_count();
+        let first = match needs.medium.needed {
+            true => config.initial_count().max(config.subsurface.seeds.min(config.density.max_gaussians)),
+            false => config.initial_count(),
+        };
         let wanted = if needs.density.needed { config.density.max_gaussians.max(first) } else { first };
         let whole = AtOnce::of(config);
         let (mut at_once, mut most) = (whole.clone(), wanted);

@@ -50,6 +50,24 @@ const FRESH: f64 = 32.0 * MIB;
 const NOT_REUSED: f64 = 0.4;
 /// The rectangle of a render over that of the photograph.
 const MARGIN: f64 = 1.2;
+/// A surfel with its share of the mesh (some 1.6 triangles), of its tree for rays and of the grid that finds it.
+const SURFEL: f64 = 2400.0;
+/// More surfels than were asked for, at most (cells of a grid that the surface meets).
+const MORE_SURFELS: f64 = 1.25;
+/// A Gaussian's surfels and their weights.
+const ATTACHED: f64 = 48.0;
+/// A cell of the grid from which the surface is taken: its value, its weight, the inside that is flooded.
+const CARVED: f64 = 16.0;
+/// Points of the surface that the views show, and the tree that finds them.
+const SHAPE_POINTS: f64 = 200_000.0 * 56.0;
+/// A pixel that a medium is fitted to, beside its columns: what is seen there, its surfels, and while it is found its place.
+const FITTED_PIXEL: f64 = 192.0;
+/// What the process takes while a surface and a medium are found, over their arrays: measured with glibc (128², 256²).
+const FIT_SPREAD: f64 = 1.2;
+/// Pixels and photographs that a medium is fitted to, at most.
+const FITTED: [f64; 2] = [40_000.0, 64.0];
+/// Lights of which what leaves the surfels is kept.
+const LEAVING_LIGHTS: f64 = 256.0;
 const MIB: f64 = 1048576.0;
 /// Lights of which visibility is kept.
 const VISIBILITY_LIGHTS: usize = 512;
@@ -162,6 +180,15 @@ pub fn moments(
     let kept_lights = facts.lights.min(VISIBILITY_LIGHTS) as f64;
     let visibility = ("visibility", of(traced, n * (4.0 * kept_lights + 44.0 + LIGHT_GRID)));
     let kept = at_once.buffers as f64;
+    // Surface, medium, and what leaves under the lights so far; and while it is fitted, each width's share of it twice.
+    let (surface, lights) = (&config.subsurface, facts.lights as f64);
+    let surfels = MORE_SURFELS * surface.surfels as f64;
+    let widths = surface.widths as f64;
+    let held = surfels * (SURFEL + 4.0 * widths + 12.0 * lights.min(LEAVING_LIGHTS)) + ATTACHED * n;
+    let medium = ("medium", of(needs.medium.needed, held));
+    let carving = CARVED * f64::from(surface.resolution).powi(3) + SHAPE_POINTS.min(56.0 * pixels * facts.views as f64);
+    let columns = 8.0 * widths * surfels * lights.min(FITTED[1]) + FITTED[0] * (FITTED_PIXEL + 4.0 * (widths + 4.0));
+    let fitting = of(needs.medium.needed, OBSERVATION * pixels + FIT_SPREAD * (carving + columns));
 
     // A step: where the rasteriser runs backward, and where the residual does.
     let activated = n * (80.0 + 44.0);
@@ -176,7 +203,7 @@ pub fn moments(
     let images = 2.0 * array(pixels * 4.0 * (channels + 2.0)) + pixels * OBSERVATION * f64::from(config.accumulate);
     let shaded = content * (56.0 + 8.0 + 96.0 + 96.0 + 64.0 + LISTS + OBJECTIVE);
     let slot_pool = (n * slots * 64.0).min(kept);
-    let common = [program, photographs, parameters, visibility];
+    let common = [program, photographs, parameters, visibility, medium];
     let out = n * (36.0 + 4.0 * row_values);
     let backward_of_rasteriser = [
         ("rasteriser", projection + scratch + backward.max(region_data) + pulled + slot_pool + features),
@@ -197,9 +224,12 @@ pub fn moments(
     let scale = f64::from(config.consistency.target_scale).powi(2);
     let other = projection + n * slots * 4.0 * (8.0 + stride(0.0)) + n * 52.0 + pixels * (24.0 + 40.0 * scale);
     let other = ("the other view", of(needs.silhouette_consistency.needed || needs.depth_consistency.needed, other));
+    let before_the_first = [("fit of the medium", fitting), ("activations and gradients", n * 80.0)];
+    let left_by_fit = ("not used again since the fit", NOT_REUSED * fitting);
     let largest = [&backward_of_rasteriser[..], &backward_of_residual[..], &adam[..]]
         .into_iter()
-        .map(|now| [&common[..], &[pictures, other], now].concat())
+        .map(|now| [&common[..], &[pictures, other, left_by_fit], now].concat())
+        .chain([[&common[..], &before_the_first].concat()])
         .map(|parts| Moment::new("steps", &parts))
         .max_by_key(Moment::bytes);
     let transient =

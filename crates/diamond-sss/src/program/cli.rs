@@ -152,6 +152,9 @@ docs/captures.md says what a recipe can say and what is written.")]
         /// Also draw many small pictures on one (PNG): views by lights, members of a family by views
         #[arg(long, value_name = "FILE")]
         contact_sheet: Option<PathBuf>,
+        /// Also write the object's surface (PLY, in the capture's frame): the truth for `subsurface.surface` and for shape errors
+        #[arg(long, value_name = "FILE")]
+        mesh: Option<PathBuf>,
         /// Also write all images as safetensors shards into this folder, see `diamond shards`
         #[arg(long, value_name = "DIR")]
         shards: Option<PathBuf>,

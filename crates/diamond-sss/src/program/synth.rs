@@ -3,7 +3,7 @@ use super::progress::Counter;
 use super::{complain, print};
 use diamond_dataset::{Capture, OpenOptions};
 use diamond_sss::{SheetOptions, SssError, contact_sheet, family_sheet, write_output};
-use diamond_synth::{CaptureRecord, Family, Progress, Recipe, ShardOptions, Stage, export_shards, synthesize};
+use diamond_synth::{CaptureRecord, Family, Object, Progress, Recipe, ShardOptions, Stage, export_shards, synthesize};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -22,6 +22,8 @@ pub struct Wish {
     pub members: Option<u32>,
     /// Where many small pictures go.
     pub contact_sheet: Option<PathBuf>,
+    /// Where the object's surface goes.
+    pub mesh: Option<PathBuf>,
     /// Where shards go.
     pub shards: Option<PathBuf>,
 }
@@ -39,6 +41,11 @@ pub fn run(wish: &Wish) -> Result<(), SssError> {
     let is_family = toml::from_str::<toml::Table>(&text).is_ok_and(|table| table.contains_key("count"));
     let mut captures = Vec::new();
     if is_family {
+        if wish.mesh.is_some() {
+            return Err(SssError::Usage(
+                "--mesh is for one recipe, this is a family; name the member's own recipe".into(),
+            ));
+        }
         let family = Family::parse_changed(&text, &origin, &wish.changes)?;
         let count = wish.members.unwrap_or(family.count).min(family.count);
         for index in 0..count {
@@ -54,6 +61,11 @@ pub fn run(wish: &Wish) -> Result<(), SssError> {
             return Err(SssError::Usage("--members is for families (recipes with `count`)".into()));
         }
         let recipe = Recipe::parse_changed(&text, &origin, &wish.changes)?;
+        if let Some(path) = &wish.mesh {
+            let object = Object::new(&recipe, folder)?;
+            write_output(path, &object.mesh.to_ply())?;
+            print(&format!("{}: {} triangles\n", path.display(), object.mesh.triangles.len()));
+        }
         make(&recipe, folder, &wish.output)?;
         captures.push(wish.output.clone());
     }

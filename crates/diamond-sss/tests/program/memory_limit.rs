@@ -23,7 +23,8 @@ impl Case {
         ball_capture(&dir.join("capture"), views, lights, side, 8);
         let config = format!(
             "base = \"resolved\"\nname = \"{name}\"\nsteps = 6\ncheckpoint_steps = 4\n[initial]\nsource = \"uniform\"\n\
-             count = {gaussians}\n[density]\nstrategy = \"none\"\nmax_gaussians = {gaussians}\n"
+             count = {gaussians}\n[density]\nstrategy = \"none\"\nmax_gaussians = {gaussians}\n\
+             [subsurface]\nmodel = \"mlp\"\n"
         );
         std::fs::write(dir.join("case.toml"), config).unwrap();
         Self { dir }
@@ -132,6 +133,23 @@ fn photographs_and_buffers_make_room_without_a_change_of_the_result() {
     assert!(said.contains("the result is the same") && !said.contains("RESULT CHANGES"), "{said}");
     assert_planned("the same, limited", &plan, limited);
     case.assert_same("free", "limited");
+    case.clear();
+}
+
+/// A surface and a medium: found before the first step, kept to the end.
+#[test]
+fn a_medium_is_planned_for() {
+    if !linux() {
+        return;
+    }
+    let case = Case::new("memory-medium", (8, 8, 128), 4000);
+    let config = "base = \"resolved\"\nsteps = 6\n[initial]\ncount = 4000\n[density]\nstrategy = \"none\"\nmax_gaussians = 9000\n";
+    std::fs::write(case.path("case.toml"), config).unwrap();
+    let plan = case.plan(None).unwrap();
+    let (measured, said) = case.run("out", &[]);
+    assert!(said.contains("medium: profile inside a surface"), "{said}");
+    assert!(plan.to_string().contains("fit of the medium"), "{plan}");
+    assert_planned("a medium at 128²", &plan, measured);
     case.clear();
 }
 
