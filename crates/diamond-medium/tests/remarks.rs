@@ -64,7 +64,8 @@ fn remarks(material: Material, paint: impl Fn(Vec3) -> f32) -> (Medium, Vec<Stri
         .collect();
     let surface = Surface::new(mesh(), 1500).unwrap();
     let options = FitOptions { falloff: FALLOFF, ..FitOptions::default() };
-    let found = fit_profile(&surface, &images, &options).unwrap();
+    let seen: Vec<_> = images.iter().map(|image| options.sample(&surface, image, images.len()).unwrap()).collect();
+    let found = fit_profile(&surface, &seen, &options).unwrap();
     let remarks = found.remarks(surface.spacing());
     println!("{:?} {} of {} {remarks:?}", found.quality, found.mean_radius(), surface.spacing());
     (found, remarks)
