@@ -26,7 +26,8 @@ impl Turns {
         let at = |f: f32| (f64::from(f) * steps as f64).round() as u64 * u64::from(accumulate);
         let even = made as f64 / (photographs + made).max(1) as f64;
         let share = (f64::from(settings.share).min(even) * WHOLE as f64).round() as u64;
-        Self { window: (at(settings.from), at(settings.until).max(at(settings.from))), share: share.min(WHOLE) }
+        let first = at(settings.from).next_multiple_of(2);
+        Self { window: (first, at(settings.until).max(first)), share: share.min(WHOLE) }
     }
 
     /// Whether `position` is not before the first place at which a made picture may come.
@@ -34,10 +35,11 @@ impl Turns {
         position >= self.window.0
     }
 
-    /// Places of made pictures before `position`.
+    /// Places of made pictures before `position`. The first place of the window is one and even, so that with a share of a half those at which
+    /// views are compared (every so many steps, an even number) stay photographs'.
     fn made_before(&self, position: u64) -> u64 {
         let inside = position.clamp(self.window.0, self.window.1) - self.window.0;
-        ((u128::from(inside) * u128::from(self.share)) / u128::from(WHOLE)) as u64
+        (u128::from(inside) * u128::from(self.share)).div_ceil(u128::from(WHOLE)) as u64
     }
 
     /// Whose turn it is at `position` = step × accumulate + index in the batch.
@@ -50,6 +52,17 @@ impl Turns {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Photographs keep the places at which views are compared.
+    #[test]
+    fn every_other_place_is_a_photographs() {
+        let turns = Turns::new(&AugmentationSettings { share: 0.5, ..Default::default() }, 100, 1, 9, 90);
+        let compared = (0..100).filter(|step| (step + 1) % 4 == 0);
+        assert!(
+            compared.clone().count() == 25 && compared.into_iter().all(|p| matches!(turns.at(p), Turn::Photograph(_)))
+        );
+        assert_eq!((0..100).filter(|p| matches!(turns.at(*p), Turn::Made(_))).count(), 50);
+    }
 
     #[test]
     fn every_number_comes_once_and_the_share_is_kept() {

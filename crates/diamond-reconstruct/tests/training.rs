@@ -21,6 +21,8 @@ fn short(preset: &str, steps: u64) -> Config {
     // In so short a run a reset of all opacities would undo everything each few steps.
     config.density.reset_every = 0.0;
     config.visibility.every_steps = 7;
+    // A run with a medium begins near its end; see medium.rs.
+    config.subsurface.model = diamond_reconstruct::SubsurfaceModel::Mlp;
     config
 }
 
