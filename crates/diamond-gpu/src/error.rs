@@ -1,4 +1,6 @@
 //! What can go wrong on a device: one enum that says what was expected, what was found, and what to do.
+use diamond_losses::LossError;
+use diamond_shading::ShadingError;
 use diamond_splat::SplatError;
 
 /// Errors of `diamond-gpu`.
@@ -64,6 +66,10 @@ pub enum GpuError {
     },
     /// Gaussians, features, camera or settings are refused.
     Splat(SplatError),
+    /// A network, a G-buffer or settings of shading are refused.
+    Shading(ShadingError),
+    /// Pictures or options of a loss are refused.
+    Loss(LossError),
 }
 
 impl std::fmt::Display for GpuError {
@@ -76,7 +82,7 @@ impl std::fmt::Display for GpuError {
             ),
             GpuError::AdapterIndex { index, found } => write!(
                 f,
-                "device gpu:{index}: expected a number below {}, the devices are {}; `diamond devices` lists them",
+                "device gpu:{index}: expected a number below {}, the devices are {}; `diamond devices` lists them, and --device cpu needs none",
                 found.len(),
                 found.iter().enumerate().map(|(i, name)| format!("gpu:{i} ({name})")).collect::<Vec<_>>().join(", ")
             ),
@@ -111,6 +117,8 @@ impl std::fmt::Display for GpuError {
                 write!(f, "{what}: expected something that runs on a GPU, found that it does not; {instead}")
             }
             GpuError::Splat(error) => error.fmt(f),
+            GpuError::Shading(error) => error.fmt(f),
+            GpuError::Loss(error) => error.fmt(f),
         }
     }
 }
@@ -119,6 +127,8 @@ impl std::error::Error for GpuError {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         match self {
             GpuError::Splat(error) => Some(error),
+            GpuError::Shading(error) => Some(error),
+            GpuError::Loss(error) => Some(error),
             _ => None,
         }
     }
@@ -127,6 +137,18 @@ impl std::error::Error for GpuError {
 impl From<SplatError> for GpuError {
     fn from(error: SplatError) -> Self {
         GpuError::Splat(error)
+    }
+}
+
+impl From<LossError> for GpuError {
+    fn from(error: LossError) -> Self {
+        GpuError::Loss(error)
+    }
+}
+
+impl From<ShadingError> for GpuError {
+    fn from(error: ShadingError) -> Self {
+        GpuError::Shading(error)
     }
 }
 

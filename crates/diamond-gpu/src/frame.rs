@@ -136,7 +136,10 @@ pub struct GaussianGrad {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Module, Sources};
+    use crate::adam::Update;
+    use crate::losses::Photometric;
+    use crate::network::Product;
+    use crate::{Lighting, Module, Sources};
     use std::mem::{offset_of, size_of};
 
     /// Names, offsets and size of a struct as the WGSL compiler lays it out.
@@ -193,6 +196,59 @@ mod tests {
         for module in [Module::Blend, Module::BlendPull] {
             same_layout!(module, Coverage { opacity, depth, transmittance, reach });
         }
+        for module in [Module::Shade, Module::ShadePull] {
+            same_layout!(
+                module,
+                Lighting {
+                    place,
+                    directional,
+                    intensity,
+                    reference,
+                    masking,
+                    fresnel,
+                    diffuse,
+                    additive,
+                    learned_incident,
+                    normalise,
+                    surface_visibility,
+                    use_residual,
+                    scale_residual,
+                    fixed_roughness,
+                    roughness,
+                    horizon_leak,
+                    incident_offset,
+                    unused_0,
+                    unused_1,
+                    unused_2,
+                }
+            );
+        }
+        same_layout!(
+            Module::Photometric,
+            Photometric { width, height, channels, border, space, step_ssim, step_l1, step_l2 }
+        );
+        same_layout!(Module::Adam, Update { step, scale, width, seen });
+        same_layout!(
+            Module::Product,
+            Product {
+                m,
+                n,
+                k,
+                part,
+                a_i,
+                a_k,
+                b_k,
+                b_j,
+                a_first,
+                b_first,
+                c_first,
+                activation,
+                slope,
+                bias_first,
+                unused_0,
+                unused_1,
+            }
+        );
         same_layout!(Module::ProjectionPull, GaussianGrad { mean, form_a, form_b, screen });
     }
 

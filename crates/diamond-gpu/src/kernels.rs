@@ -32,6 +32,14 @@ impl Default for Sources {
             "blend_pull.wgsl",
             "splat_sum.wgsl",
             "projection_pull.wgsl",
+            "shading.wgsl",
+            "shade.wgsl",
+            "shade_pull.wgsl",
+            "adam.wgsl",
+            "density_stats.wgsl",
+            "product.wgsl",
+            "photometric.wgsl",
+            "mask_bce.wgsl",
         ];
         Self(files.into_iter().map(|(name, text)| (name, text.to_string())).collect())
     }
@@ -79,11 +87,25 @@ pub enum Module {
     SplatSum,
     /// `projection_pull.wgsl`
     ProjectionPull,
+    /// `shade.wgsl`
+    Shade,
+    /// `shade_pull.wgsl`
+    ShadePull,
+    /// `adam.wgsl`
+    Adam,
+    /// `density_stats.wgsl`
+    DensityStats,
+    /// `product.wgsl`
+    Product,
+    /// `photometric.wgsl`
+    Photometric,
+    /// `mask_bce.wgsl`
+    MaskBce,
 }
 
 impl Module {
     /// All of them.
-    pub const ALL: [Module; 10] = [
+    pub const ALL: [Module; 17] = [
         Module::Projection,
         Module::Scan,
         Module::Sort,
@@ -94,6 +116,13 @@ impl Module {
         Module::BlendPull,
         Module::SplatSum,
         Module::ProjectionPull,
+        Module::Shade,
+        Module::ShadePull,
+        Module::Adam,
+        Module::DensityStats,
+        Module::Product,
+        Module::Photometric,
+        Module::MaskBce,
     ];
 
     /// The files that it is compiled from, in this order.
@@ -109,6 +138,13 @@ impl Module {
             Module::BlendPull => &["frame.wgsl", "pair.wgsl", "alpha.wgsl", "blend_pull.wgsl"],
             Module::SplatSum => &["frame.wgsl", "splat_sum.wgsl"],
             Module::ProjectionPull => &["frame.wgsl", "pair.wgsl", "linearised.wgsl", "projection_pull.wgsl"],
+            Module::Shade => &["frame.wgsl", "pair.wgsl", "shading.wgsl", "shade.wgsl"],
+            Module::ShadePull => &["frame.wgsl", "pair.wgsl", "shading.wgsl", "shade_pull.wgsl"],
+            Module::Adam => &["frame.wgsl", "adam.wgsl"],
+            Module::DensityStats => &["frame.wgsl", "density_stats.wgsl"],
+            Module::Product => &["frame.wgsl", "product.wgsl"],
+            Module::Photometric => &["frame.wgsl", "photometric.wgsl"],
+            Module::MaskBce => &["frame.wgsl", "mask_bce.wgsl"],
         }
     }
 
@@ -125,6 +161,13 @@ impl Module {
             Module::BlendPull => "rrrrrrrw",
             Module::SplatSum => "rrrw",
             Module::ProjectionPull => "rrrrrw",
+            Module::Shade => "rrrw",
+            Module::ShadePull => "rrrrww",
+            Module::Adam => "rrwwwr",
+            Module::DensityStats => "rrw",
+            Module::Product => "rrrw",
+            Module::Photometric => "rrwrwwww",
+            Module::MaskBce => "rrww",
         }
     }
 }

@@ -7,9 +7,11 @@ use crate::stage::{STAGES, Stage, Step, blend_pull_and_sum, steps};
 use crate::{Device, GpuError, scene_arrays};
 use diamond_camera::Camera;
 use diamond_image::Image;
+use diamond_reconstruct::Blender;
 use diamond_splat::{
     Cutoff, Features, Gaussians, Raster, RasterConfig, RasterGrad, RasterPull, RasterStats, SplatError,
 };
+use std::sync::Arc;
 
 /// Entries per Gaussian that room is made for before the first picture says how many there are.
 const FIRST_GUESS: u64 = 4;
@@ -20,10 +22,19 @@ const SPARE: u64 = 8;
 ///
 /// Two runs on one device give the same bits: entries are sorted without ties, and sums are made in a fixed order.
 #[derive(Debug)]
-pub struct Rasterizer<'d> {
-    device: &'d Device,
+pub struct Rasterizer {
+    device: Arc<Device>,
     arrays: Arrays,
     capacity: u64,
+    /// The last picture, if it can be pulled back.
+    last: Option<Last>,
+}
+
+/// What is remembered of a picture.
+#[derive(Debug, Clone, Copy)]
+struct Last {
+    shape: Shape,
+    factors: bool,
 }
 
 /// How large a picture was for the device.
@@ -37,20 +48,20 @@ pub struct DeviceStats {
 
 /// The reverse of one picture. The Gaussians lie on the device, and the device is borrowed until this is used.
 #[derive(Debug)]
-pub struct DevicePullback<'r, 'd> {
-    rasterizer: &'r mut Rasterizer<'d>,
-    shape: Shape,
-    factors: bool,
+pub struct DevicePullback<'r> {
+    rasterizer: &'r mut Rasterizer,
+    last: Last,
     stats: DeviceStats,
 }
 
-impl<'d> Rasterizer<'d> {
+impl Rasterizer {
     /// On a device.
     ///
     /// # Errors
     /// The device has no room left.
-    pub fn new(device: &'d Device) -> Result<Self, GpuError> {
-        Ok(Self { device, arrays: Arrays::new(device)?, capacity: 0 })
+    pub fn new(device: Arc<Device>) -> Result<Self, GpuError> {
+        let arrays = Arrays::new(&device)?;
+        Ok(Self { device, arrays, capacity: 0, last: None })
     }
 
     /// Projects and blends, as [`diamond_splat::rasterize`] does `[eq:splat-blend]`: the same thresholds, the same order.
@@ -66,9 +77,21 @@ impl<'d> Rasterizer<'d> {
         features: &Features,
         camera: &Camera,
         config: &RasterConfig,
-    ) -> Result<(Raster, DevicePullback<'_, 'd>), GpuError> {
+    ) -> Result<(Raster, DevicePullback<'_>), GpuError> {
+        let (raster, stats, last) = self.picture(gaussians, features, camera, config)?;
+        Ok((raster, DevicePullback { rasterizer: self, last, stats }))
+    }
+
+    fn picture(
+        &mut self,
+        gaussians: &Gaussians,
+        features: &Features,
+        camera: &Camera,
+        config: &RasterConfig,
+    ) -> Result<(Raster, DeviceStats, Last), GpuError> {
+        self.last = None;
         validate(gaussians, features, camera, config)?;
-        let device = self.device;
+        let device = &*self.device;
         let n = gaussians.len() as u64;
         let size = [camera.intrinsics.width, camera.intrinsics.height].map(u64::from);
         let forms = scene_arrays::gaussians(gaussians);
@@ -108,8 +131,9 @@ impl<'d> Rasterizer<'d> {
             }
             let stats = DeviceStats { visible: counts[3].into(), entries };
             let raster = assemble(&shape, picture, coverage, stats)?;
-            let factors = !gaussians.factors.is_empty();
-            return Ok((raster, DevicePullback { rasterizer: self, shape, factors, stats }));
+            let last = Last { shape, factors: !gaussians.factors.is_empty() };
+            self.last = Some(last);
+            return Ok((raster, stats, last));
         }
     }
 }
@@ -166,7 +190,7 @@ fn validate(g: &Gaussians, features: &Features, camera: &Camera, config: &Raster
 /// As many as the CPU takes.
 const MAX_GAUSSIANS: usize = 1 << 28;
 
-impl DevicePullback<'_, '_> {
+impl DevicePullback<'_> {
     /// How large the picture was for the device.
     pub fn stats(&self) -> DeviceStats {
         self.stats
@@ -178,7 +202,13 @@ impl DevicePullback<'_, '_> {
     /// Images of the wrong shape or with values that are not finite; arrays beyond the device's limits or memory; a lost
     /// device.
     pub fn pull(self, d: &RasterGrad) -> Result<RasterPull, GpuError> {
-        let Self { rasterizer, shape, factors, .. } = self;
+        self.rasterizer.pull(self.last, d)
+    }
+}
+
+impl Rasterizer {
+    fn pull(&mut self, last: Last, d: &RasterGrad) -> Result<RasterPull, GpuError> {
+        let Last { shape, factors } = last;
         let (width, height, n) = (shape.width as usize, shape.height as usize, shape.gaussians as usize);
         check(&d.features, (width, height, shape.channels), "RasterGrad::features")?;
         check(&d.opacity, (width, height, 1), "RasterGrad::opacity")?;
@@ -186,7 +216,7 @@ impl DevicePullback<'_, '_> {
         if n == 0 {
             return Ok(RasterPull::default());
         }
-        let (device, arrays) = (rasterizer.device, &mut rasterizer.arrays);
+        let (device, arrays) = (&*self.device, &mut self.arrays);
         let mut all = blend_pull_and_sum(&shape);
         all.extend(steps(Stage::ProjectionPull, &shape));
         arrays.reserve(device, &shape, &columns_of(&all))?;
@@ -201,6 +231,29 @@ impl DevicePullback<'_, '_> {
         let (gaussians, screen) = scene_arrays::gradient(&read[0], n, factors);
         let features = scene_arrays::rows(&shape, Column::DFeatures, &read[1], n);
         Ok(RasterPull { gaussians, features, screen })
+    }
+}
+
+/// Training pictures are blended on the device: their channels go there and their gradients come back, step by step.
+impl Blender for Rasterizer {
+    fn name(&self) -> &str {
+        &self.device.adapter().name
+    }
+
+    fn blend(
+        &mut self,
+        gaussians: &Gaussians,
+        features: &Features,
+        camera: &Camera,
+        config: &RasterConfig,
+    ) -> Result<Raster, String> {
+        let made = self.picture(gaussians, features, camera, config);
+        made.map(|(raster, _, _)| raster).map_err(|error| error.to_string())
+    }
+
+    fn pull(&mut self, d: &RasterGrad) -> Result<RasterPull, String> {
+        let last = self.last.ok_or("no picture was blended before its gradient was asked for")?;
+        Rasterizer::pull(self, last, d).map_err(|error| error.to_string())
     }
 }
 

@@ -60,6 +60,12 @@ pub(crate) fn d_coverage(opacity: &Image, depth: &Image) -> Vec<u32> {
     opacity.data().iter().zip(depth.data()).flat_map(|(o, d)| [o.to_bits(), d.to_bits()]).collect()
 }
 
+/// Gradients of screen positions where the gradient of the Gaussians holds them.
+pub(crate) fn d_screen(screen: &[Vec2]) -> Vec<u32> {
+    let row = |d: &Vec2| GaussianGrad { screen: [d.x, d.y, 0.0, 0.0], ..Default::default() };
+    bytemuck::pod_collect_to_vec(&screen.iter().map(row).collect::<Vec<_>>())
+}
+
 /// Gradients as the CPU gives them, and those of screen positions.
 pub(crate) fn gradient(words: &[u32], n: usize, factors: bool) -> (GaussiansGrad, Vec<Vec2>) {
     let all: Vec<GaussianGrad> = bytemuck::pod_collect_to_vec(words);

@@ -128,6 +128,75 @@ pub const STAGES: &[StageRow] = &[
     },
 ];
 
+/// A part of the training step that runs on a device but is not yet chained to the stages there: each is called with arrays of the host.
+#[derive(Debug)]
+pub struct ComponentRow {
+    /// Its name, and that of its function in this crate.
+    pub name: &'static str,
+    /// Its file: `wgsl/FILE.wgsl`.
+    pub file: &'static str,
+    /// The CPU function that it is compared with.
+    pub twin: &'static str,
+    /// Whether it belongs to the forward or to the backward pass.
+    pub backward: bool,
+    /// Largest relative error (L2 over an array) against its twin.
+    pub tolerance: f64,
+}
+
+/// Every such part.
+pub const COMPONENTS: &[ComponentRow] = &[
+    ComponentRow {
+        name: "mlp_forward",
+        file: "product",
+        twin: "diamond_shading::Mlp::forward",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "mlp_pull",
+        file: "product",
+        twin: "diamond_shading::MlpPullback::pull",
+        backward: true,
+        tolerance: 1e-5,
+    },
+    ComponentRow { name: "shade", file: "shade", twin: "diamond_shading::shade", backward: false, tolerance: 1e-5 },
+    ComponentRow {
+        name: "shade_pull",
+        file: "shade_pull",
+        twin: "diamond_shading::ShadePullback::pull",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "photometric",
+        file: "photometric",
+        twin: "diamond_losses::photometric",
+        backward: true,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "mask_bce",
+        file: "mask_bce",
+        twin: "diamond_losses::mask_bce",
+        backward: true,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "adam_step",
+        file: "adam",
+        twin: "diamond_reconstruct::adam::adam_step",
+        backward: true,
+        tolerance: 1e-6,
+    },
+    ComponentRow {
+        name: "record_view",
+        file: "density_stats",
+        twin: "diamond_splat::density::DensityStats::record",
+        backward: true,
+        tolerance: 1e-6,
+    },
+];
+
 /// Something that the device does.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Step {
@@ -147,7 +216,7 @@ pub(crate) enum Step {
 const MAX_GRID: u64 = 65_535;
 
 /// A grid of so many workgroups.
-fn grid(workgroups: u64) -> [u32; 2] {
+pub(crate) fn grid(workgroups: u64) -> [u32; 2] {
     if workgroups <= MAX_GRID {
         return [workgroups as u32, 1];
     }
@@ -373,7 +442,8 @@ mod tests {
         let names: Vec<&str> = STAGES.iter().map(|row| row.name).collect();
         for module in Module::ALL {
             let file = module.files().last().unwrap().trim_end_matches(".wgsl");
-            assert!(names.contains(&file) || ["scan", "sort"].contains(&file), "{file}");
+            let component = COMPONENTS.iter().any(|row| row.file == file);
+            assert!(names.contains(&file) || component || ["scan", "sort"].contains(&file), "{file}");
         }
     }
 

@@ -6,7 +6,7 @@ use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
 use crate::visibility_cache::VisibilityCache;
 use crate::{
-    Activated, ActivatedGrad, Attribute, CaptureFacts, Counters, DensityStrategy, Engine, ExposureMode,
+    Activated, ActivatedGrad, Attribute, Blender, CaptureFacts, Counters, DensityStrategy, Engine, ExposureMode,
     GaussianParameters, Layout, MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport,
     TensorFile, TrainingPair, adam, error,
 };
@@ -28,6 +28,8 @@ pub struct CpuEngine {
     counters: Counters,
     /// Training views.
     views: usize,
+    /// Who blends training pictures, if not the CPU.
+    blender: Option<Box<dyn Blender>>,
 }
 
 /// Steps after which Gaussians look anew for the surfels around them.
@@ -85,6 +87,7 @@ impl CpuEngine {
             profile: Profile::default(),
             counters: Counters::default(),
             views: 1,
+            blender: None,
         }
     }
 
@@ -180,7 +183,7 @@ impl CpuEngine {
 
 impl Engine for CpuEngine {
     fn name(&self) -> &str {
-        "cpu"
+        self.blender.as_ref().map_or("cpu", |blender| blender.name())
     }
 
     fn training_step(
@@ -233,7 +236,8 @@ impl Engine for CpuEngine {
                     share,
                 }),
             };
-            let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters };
+            let blender = self.blender.as_mut();
+            let mut meters = forward::Meters { profile: &mut self.profile, counters: &mut self.counters, blender };
             let mode = self.model.config.exposure.mode;
             // Pictures that nobody took have the exposure of renderings, and do not change it.
             let (own, factor) = match pair.believed {
@@ -341,6 +345,10 @@ impl Engine for CpuEngine {
 
     fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
         self.model.render(camera, lights)
+    }
+
+    fn blend_by(&mut self, blender: Box<dyn Blender>) {
+        self.blender = Some(blender);
     }
 
     fn adopt_medium(&mut self, medium: MediumTerm) -> Result<(), ReconstructError> {

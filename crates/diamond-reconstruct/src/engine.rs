@@ -1,7 +1,7 @@
 //! What runs a training step and renders: the CPU now, a GPU later, behind one trait.
 use crate::objective::TermValue;
 use crate::region::Region;
-use crate::{Guide, MediumTerm, Model, ReconstructError, StepPlan, TensorFile};
+use crate::{Blender, Guide, MediumTerm, Model, ReconstructError, StepPlan, TensorFile};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask};
 use diamond_light::OlatLight;
@@ -93,6 +93,9 @@ pub trait Engine {
 
     /// Renders one camera under each light.
     fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError>;
+
+    /// From now on training pictures are blended by `blender`.
+    fn blend_by(&mut self, blender: Box<dyn Blender>);
 
     /// Takes a medium into the model, the first one or another.
     fn adopt_medium(&mut self, medium: MediumTerm) -> Result<(), ReconstructError>;

@@ -43,6 +43,11 @@ pub enum ReconstructError {
         /// Index and value of the first offender.
         detail: String,
     },
+    /// A device that part of a step runs on failed.
+    Device {
+        /// What is wrong and what to do.
+        detail: String,
+    },
     /// A lower crate refused its input: a mistake of ours rather than of the user's.
     Internal {
         /// Which stage.
@@ -67,6 +72,7 @@ impl std::fmt::Display for ReconstructError {
                 "step {step}: {what} is not finite ({detail}); the run was stopped, the last checkpoint is intact: \
                  lower the learning rates or report the capture"
             ),
+            Self::Device { detail } => write!(f, "{detail}"),
             Self::Internal { stage, detail } => write!(f, "stage {stage}: {detail}"),
         }
     }

@@ -9,7 +9,7 @@ use crate::rows::{
     LightRows, Rows, Transported, VisibilitySource, geometry_features, input_scaling, residual_inputs, transfer_config,
 };
 use crate::{
-    Activated, ActivatedGrad, CombineVariant, Counters, DiffuseVariant, FresnelVariant, IncidentVariant,
+    Activated, ActivatedGrad, Blender, CombineVariant, Counters, DiffuseVariant, FresnelVariant, IncidentVariant,
     MaskingVariant, MediumTerm, Model, ReconstructError, StepPlan, error,
 };
 use diamond_camera::Camera;
@@ -170,6 +170,8 @@ pub struct Meters<'a> {
     pub profile: &'a mut Profile,
     /// Work.
     pub counters: &'a mut Counters,
+    /// Who blends, if not the CPU.
+    pub blender: Option<&'a mut Box<dyn Blender>>,
 }
 
 impl Pass<'_> {
@@ -194,7 +196,7 @@ pub fn value_and_grad(
     objective: impl FnOnce(&View<'_>) -> Result<ViewGrad, ReconstructError>,
 ) -> Result<PairGrad, ReconstructError> {
     let Pass { model, activated, camera, light, settings, needs, .. } = *pass;
-    let Meters { profile, counters } = meters;
+    let Meters { profile, counters, blender } = meters;
     let layout = &needs.layout;
     let n = model.len();
     let t = Instant::now();
@@ -239,8 +241,18 @@ pub fn value_and_grad(
     };
     transported.write(&mut features, 0, &rows.visible, layout);
     let t = profile.add("features", t);
-    let (raster, raster_pullback) =
-        rasterize_projected(&projection, &activated.gaussians, &features).map_err(error::stage("rasterize"))?;
+    let device = |detail| ReconstructError::Device { detail };
+    let (raster, raster_pullback) = match blender {
+        Some(blender) => {
+            let config = projection.config();
+            (blender.blend(&activated.gaussians, &features, camera, config).map_err(device)?, None)
+        }
+        None => {
+            let blended = rasterize_projected(&projection, &activated.gaussians, &features);
+            let (raster, pullback) = blended.map_err(error::stage("rasterize"))?;
+            (raster, Some(pullback))
+        }
+    };
     let t = profile.add("rasterize forward", t);
     let (width, height, _) = raster.opacity.shape();
     let region = pass.region(&raster.opacity);
@@ -277,7 +289,11 @@ pub fn value_and_grad(
         }
     }
     let t = profile.add("shade backward", t);
-    let pulled = raster_pullback.pull(&d).map_err(error::stage("rasterize.pull"))?;
+    let pulled = match (raster_pullback, blender) {
+        (Some(pullback), _) => pullback.pull(&d).map_err(error::stage("rasterize.pull"))?,
+        (None, Some(blender)) => blender.pull(&d).map_err(device)?,
+        (None, None) => return Err(error::stage("rasterize.pull")("nobody blended the picture")),
+    };
     let t = profile.add("rasterize backward", t);
 
     let mut out = ActivatedGrad { gaussians: pulled.gaussians, ..zero_materials(n) };

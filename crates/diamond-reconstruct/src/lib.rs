@@ -18,6 +18,7 @@ pub mod adam;
 mod agreement;
 mod augmentation;
 mod augmentation_settings;
+mod blender;
 mod byte_size;
 mod channel_layout;
 mod config;
@@ -53,6 +54,7 @@ mod turns;
 mod visibility_cache;
 
 pub use augmentation_settings::{AugmentationSettings, AugmentationSource};
+pub use blender::Blender;
 pub use byte_size::ByteSize;
 pub use channel_layout::ChannelLayout;
 pub use config::*;

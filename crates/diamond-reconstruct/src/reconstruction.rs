@@ -9,8 +9,8 @@ use crate::scene::{self, InitialPoints};
 use crate::tensor_file::TensorFile;
 use crate::turns::{Turn, Turns};
 use crate::{
-    CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Guide, Model, Needs, Neighbour, ReconstructError,
-    Rendering, Scene, StepPlan, StepReport, TrainingPair,
+    Blender, CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Guide, Model, Needs, Neighbour,
+    ReconstructError, Rendering, Scene, StepPlan, StepReport, TrainingPair,
 };
 use diamond_augment::{Frame, Source};
 use diamond_camera::Camera;
@@ -133,6 +133,11 @@ impl Reconstruction {
             notes: Vec::new(),
             initial_origin: points.origin.clone(),
         })
+    }
+
+    /// From now on training pictures are blended by `blender`.
+    pub fn blend_by(&mut self, blender: Box<dyn Blender>) {
+        self.engine.blend_by(blender);
     }
 
     /// Continues from the checkpoint in `folder`, bit for bit as if the run had not been interrupted. The configuration

@@ -65,7 +65,9 @@ impl SssError {
                 | ReconstructError::Unusable { .. }
                 | ReconstructError::Checkpoint { .. } => 3,
                 ReconstructError::Io { action, source, .. } => reading(action, source),
-                ReconstructError::NonFinite { .. } | ReconstructError::Internal { .. } => 1,
+                ReconstructError::NonFinite { .. }
+                | ReconstructError::Device { .. }
+                | ReconstructError::Internal { .. } => 1,
             },
             Self::Io { action, source, .. } => reading(action, source),
             Self::Interrupted { .. } => 130,

@@ -10,6 +10,7 @@ use crate::{
 };
 use diamond_augment::Lack;
 use diamond_dataset::{Capture, Selection, SelectionManifest};
+use diamond_gpu::{Device, DeviceChoice, Rasterizer};
 use diamond_reconstruct::{
     ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
     StepReport,
@@ -17,6 +18,7 @@ use diamond_reconstruct::{
 use diamond_splat::remove_leftovers;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -47,6 +49,8 @@ pub struct ReconstructOptions {
     pub selection: Option<PathBuf>,
     /// Points (PLY) or splats (any format) to start from, in place of the capture's.
     pub initial: Option<PathBuf>,
+    /// Where training pictures are blended; everything else runs on the CPU.
+    pub device: DeviceChoice,
     /// Continue from the checkpoint.
     pub resume: bool,
     /// Replace the results of an earlier run.
@@ -71,6 +75,7 @@ impl ReconstructOptions {
             lights: Selection::All,
             selection: None,
             initial: None,
+            device: DeviceChoice::Cpu,
             resume: false,
             force: false,
             command: String::new(),
@@ -238,6 +243,8 @@ fn run(
 ) -> Result<Outcome, SssError> {
     let begun = Instant::now();
     let mut config = options.config()?;
+    // Before anything is written: a device that is not there is a wrong option.
+    let device = Device::open(options.device).map_err(|e| SssError::Usage(e.to_string()))?.map(Arc::new);
     let instruction_set = config.instruction_set.apply().map_err(|e| SssError::Usage(e.to_string()))?;
     let folder = options.output.as_path();
     let checkpoint = folder.join("checkpoint");
@@ -296,6 +303,10 @@ fn run(
         Reconstruction::new(capture.clone(), &config)?
     };
     training.keep_pictures_in(&folder.join(MADE_PICTURES));
+    if let Some(device) = device {
+        events(Event::Note(format!("training pictures are blended on {}", device.adapter().name)));
+        training.blend_by(Box::new(Rasterizer::new(device).map_err(device_error)?));
+    }
     peak_after.note("first Gaussians");
     let mut log = match resumed {
         true => TrainingLog::read_until(&folder.join("log.csv"), config.steps, training.steps_done()),
@@ -462,4 +473,8 @@ fn write_profile(folder: &Path, steps: u64, costs: &Costs, peak_after: &PeakAfte
         "peak_bytes_after": peak_after,
     });
     write_json(&folder.join("profile.json"), &value)
+}
+
+fn device_error(error: diamond_gpu::GpuError) -> SssError {
+    SssError::Reconstruct(ReconstructError::Device { detail: error.to_string() })
 }

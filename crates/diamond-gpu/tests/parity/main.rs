@@ -1,24 +1,26 @@
 //! Every stage on the device against its twin on the CPU, and the whole against the CPU's rasteriser. Without a device all tests
 //! are reported as ignored, with the reason; with DIAMOND_REQUIRE_GPU=1 its absence is a failure.
 mod compare;
+mod components;
+mod reconstruction;
 mod scenes;
 
 use compare::{Difference, relative_l2};
 use diamond_gpu::{
-    Device, DeviceChoice, GpuError, HostState, RasterScene, Rasterizer, STAGES, Side, Sources, adapters,
+    COMPONENTS, Device, DeviceChoice, GpuError, HostState, RasterScene, Rasterizer, STAGES, Side, Sources, adapters,
 };
 use diamond_splat::{Cutoff, Gaussians, Raster, RasterPull, rasterize};
 use libtest_mimic::{Arguments, Failed, Trial};
 use std::process::ExitCode;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 /// Asks that a missing device is a failure and not a reason to ignore.
 const REQUIRED: &str = "DIAMOND_REQUIRE_GPU";
 
 /// The tests' device: the best there is, software too.
-fn device() -> Result<&'static Device, String> {
-    static DEVICE: OnceLock<Result<Device, String>> = OnceLock::new();
-    DEVICE.get_or_init(|| open(Sources::default())).as_ref().map_err(Clone::clone)
+fn device() -> Result<&'static Arc<Device>, String> {
+    static DEVICE: OnceLock<Result<Arc<Device>, String>> = OnceLock::new();
+    DEVICE.get_or_init(|| open(Sources::default()).map(Arc::new)).as_ref().map_err(Clone::clone)
 }
 
 fn open(sources: Sources) -> Result<Device, String> {
@@ -48,7 +50,7 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
 
-type Test = Box<dyn FnOnce(&'static Device) -> Result<(), String> + Send>;
+type Test = Box<dyn FnOnce(&'static Arc<Device>) -> Result<(), String> + Send>;
 
 fn tests() -> Vec<(String, Test)> {
     let mut tests: Vec<(String, Test)> = Vec::new();
@@ -62,14 +64,27 @@ fn tests() -> Vec<(String, Test)> {
     tests.push(("whole, in pieces".into(), Box::new(|device| whole(device, "in pieces", &scenes::in_pieces()))));
     tests.push(("any stage may be the first on the device".into(), Box::new(switch)));
     tests.push(("two runs give the same bits".into(), Box::new(same_bits)));
+    let test: Test = Box::new(|device| reconstruction::agrees(device));
+    tests.push(("a small reconstruction agrees with the CPU's".into(), test));
     tests.push(("bad input is an error".into(), Box::new(bad_input)));
+    for row in COMPONENTS {
+        tests.push((
+            format!("component, {}", row.name),
+            Box::new(move |device| {
+                let worst = components::component(device, row.name)?;
+                println!("parity: {}: {worst:.1e}", row.name);
+                Ok(())
+            }),
+        ));
+        tests.push((format!("planted, {}", row.name), Box::new(move |_| planted_component(row.name))));
+    }
     for row in STAGES {
         tests.push((format!("planted, {}", row.name), Box::new(move |_| planted(row.name))));
     }
     tests
 }
 
-fn stages(device: &'static Device, name: &str, scene: RasterScene) -> Result<(), String> {
+fn stages(device: &'static Arc<Device>, name: &str, scene: RasterScene) -> Result<(), String> {
     let state = HostState::new(scene, device.max_binding()).map_err(|error| error.to_string())?;
     let worst = compare::stages(&state, Side::Gpu(device))
         .map_err(|Difference { stage, what }| format!("{name}: stage {stage}: {what}"))?;
@@ -119,14 +134,14 @@ fn on_cpu(scene: &RasterScene) -> Result<(Raster, RasterPull), String> {
     Ok((raster, pull))
 }
 
-fn on_device(rasterizer: &mut Rasterizer<'_>, scene: &RasterScene) -> Result<(Raster, RasterPull), GpuError> {
+fn on_device(rasterizer: &mut Rasterizer, scene: &RasterScene) -> Result<(Raster, RasterPull), GpuError> {
     let (raster, pullback) = rasterizer.rasterize(&scene.gaussians, &scene.features, &scene.camera, &scene.config)?;
     let pull = pullback.pull(&scene.d)?;
     Ok((raster, pull))
 }
 
-fn whole(device: &'static Device, name: &str, scene: &RasterScene) -> Result<(), String> {
-    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+fn whole(device: &'static Arc<Device>, name: &str, scene: &RasterScene) -> Result<(), String> {
+    let mut rasterizer = Rasterizer::new(device.clone()).map_err(|error| error.to_string())?;
     let found = on_device(&mut rasterizer, scene).map_err(|error| error.to_string())?;
     let expected = on_cpu(scene)?;
     if found.0.stats.visible != expected.0.stats.visible {
@@ -136,7 +151,7 @@ fn whole(device: &'static Device, name: &str, scene: &RasterScene) -> Result<(),
 }
 
 /// The first stages on the CPU, the rest on the device, for every number of stages.
-fn switch(device: &'static Device) -> Result<(), String> {
+fn switch(device: &'static Arc<Device>) -> Result<(), String> {
     let (_, scene) = scenes::all().swap_remove(0);
     let state = HostState::new(scene.clone(), device.max_binding()).map_err(|error| error.to_string())?;
     let expected = on_cpu(&scene)?;
@@ -152,9 +167,9 @@ fn switch(device: &'static Device) -> Result<(), String> {
     Ok(())
 }
 
-fn same_bits(device: &'static Device) -> Result<(), String> {
+fn same_bits(device: &'static Arc<Device>) -> Result<(), String> {
     let scene = scenes::large();
-    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+    let mut rasterizer = Rasterizer::new(device.clone()).map_err(|error| error.to_string())?;
     let mut run = || on_device(&mut rasterizer, &scene).map_err(|error| error.to_string());
     let (first, second) = (run()?, run()?);
     if first != second {
@@ -163,9 +178,9 @@ fn same_bits(device: &'static Device) -> Result<(), String> {
     Ok(())
 }
 
-fn bad_input(device: &'static Device) -> Result<(), String> {
+fn bad_input(device: &'static Arc<Device>) -> Result<(), String> {
     let (_, scene) = scenes::all().swap_remove(0);
-    let mut rasterizer = Rasterizer::new(device).map_err(|error| error.to_string())?;
+    let mut rasterizer = Rasterizer::new(device.clone()).map_err(|error| error.to_string())?;
     type Damage = fn(&mut RasterScene);
     let damages: [(&str, Damage); 5] = [
         ("a mean that is no number", |s| s.gaussians.means[3].x = f32::NAN),
@@ -204,8 +219,29 @@ fn plants(stage: &str) -> Option<(&'static str, &'static str, &'static str)> {
         "blend_pull" => ("blend_pull.wgsl", "behind = fma(a, gain, behind);", "behind = fma(a, gain, behind * 0.999);"),
         "splat_sum" => ("splat_sum.wgsl", "entry < end;", "entry + 1u < end;"),
         "projection_pull" => ("projection_pull.wgsl", "d_k += d_s[j] * c.s;", "d_k += d_s[j] * c.s * 1.001;"),
+        "mlp_forward" => ("product.wgsl", "let x = c[i] + b[", "let x = 1.0001 * c[i] + b["),
+        "mlp_pull" => ("product.wgsl", "select(product.slope, 1.0, y > 0.0)", "select(product.slope, 1.0, y > 0.1)"),
+        "shade" => ("shade.wgsl", "* seen * weights.x * p.opacity", "* seen * weights.x * p.opacity * 1.001"),
+        "shade_pull" => ("shade_pull.wgsl", "d_depth += dot(", "d_depth -= dot("),
+        "photometric" => ("photometric.wgsl", "s_bb += w * d_b * d_b;", "s_bb += w * d_b * d_b * 1.001;"),
+        "mask_bce" => ("mask_bce.wgsl", "/ (cut * through)", "/ (cut * max(through, 0.01))"),
+        "adam_step" => ("adam.wgsl", "const BETA_2: f32 = 0.999;", "const BETA_2: f32 = 0.99901;"),
+        "record_view" => ("density_stats.wgsl", "before.y + 1.0", "before.y + 2.0"),
         _ => return None,
     })
+}
+
+/// The first component of the file that is found wrong is the one where the error is.
+fn planted_component(name: &'static str) -> Result<(), String> {
+    let (file, from, to) = plants(name).ok_or("no error is planted in this component")?;
+    let sources = Sources::default().with_edit(file, from, to).ok_or("there is nothing to replace")?;
+    let device = open(sources)?;
+    let mut suspects = COMPONENTS.iter().filter(|row| file.starts_with(row.file));
+    match suspects.find(|row| components::component(&device, row.name).is_err()) {
+        None => Err(format!("an error in {name} was not found")),
+        Some(row) if row.name == name => Ok(()),
+        Some(row) => Err(format!("an error in {name} was taken for one in {}", row.name)),
+    }
 }
 
 /// The harness finds the error, and in the stage where it is.

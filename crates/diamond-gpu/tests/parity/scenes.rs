@@ -7,7 +7,7 @@ use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 
 /// Uniform in [low, high).
-fn uniform(rng: &mut Pcg64Mcg, low: f32, high: f32) -> f32 {
+pub fn uniform(rng: &mut Pcg64Mcg, low: f32, high: f32) -> f32 {
     low + (high - low) * ((rng.next_u32() >> 8) as f32 / 16_777_216.0)
 }
 

@@ -1,6 +1,7 @@
 //! The words of the command line.
 use clap::{Args, Parser, Subcommand};
 use diamond_dataset::{Regime, Selection};
+use diamond_gpu::DeviceChoice;
 use diamond_reconstruct::{ByteSize, InstructionChoice};
 use diamond_splat_files::{SplatFormat, WriteOptions};
 use diamond_sss::ExportOptions;
@@ -250,6 +251,10 @@ pub struct ReconstructArguments {
     /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: the configuration]
     #[arg(long, value_name = "NAME")]
     pub instruction_set: Option<InstructionChoice>,
+    /// Where training pictures are blended, forward and backward: cpu, gpu, gpu:N (`diamond devices` lists them), or auto (a GPU
+    /// that is not software, else cpu). Everything else runs on the CPU
+    #[arg(long, value_name = "NAME", default_value = "cpu")]
+    pub device: DeviceChoice,
     /// What the process may take in memory: 512MiB, 2GiB, bytes. Caches shrink first, which changes no result, then the
     /// number of Gaussians, which is said [default: the configuration, else no limit]
     #[arg(long, value_name = "SIZE")]

@@ -35,6 +35,7 @@ pub fn run(a: ReconstructArguments) -> Result<(), SssError> {
         lights,
         selection: a.selection,
         initial: a.initial,
+        device: a.device,
         resume: a.resume,
         force: a.force,
         command: std::env::args().collect::<Vec<_>>().join(" "),

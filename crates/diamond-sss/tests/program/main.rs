@@ -42,6 +42,18 @@ fn devices_are_listed_with_the_cpu_first() {
 }
 
 #[test]
+fn a_device_that_is_not_there_is_a_wrong_option() {
+    let dir = scratch("device");
+    let (capture, out) = (dir.join("capture"), dir.join("out"));
+    tiny_capture(&capture, 2, 1);
+    for (device, word) in [("gpu:99", "--device cpu"), ("tpu", "gpu:N")] {
+        let wrong = diamond(&["reconstruct", text(&capture), "-o", text(&out), "--device", device]);
+        assert_eq!(wrong.status.code(), Some(2), "{}", stderr(&wrong));
+        assert!(stderr(&wrong).contains(word) && !out.exists(), "{device}: {}", stderr(&wrong));
+    }
+}
+
+#[test]
 fn from_capture_to_report_and_pictures() {
     let dir = scratch("end-to-end");
     let (capture, out, config) = (dir.join("capture"), dir.join("out"), small_config(&dir));
