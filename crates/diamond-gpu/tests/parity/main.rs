@@ -64,7 +64,7 @@ fn tests() -> Vec<(String, Test)> {
     tests.push(("whole, in pieces".into(), Box::new(|device| whole(device, "in pieces", &scenes::in_pieces()))));
     tests.push(("any stage may be the first on the device".into(), Box::new(switch)));
     tests.push(("two runs give the same bits".into(), Box::new(same_bits)));
-    let test: Test = Box::new(|device| reconstruction::agrees(device));
+    let test: Test = Box::new(reconstruction::agrees);
     tests.push(("a small reconstruction agrees with the CPU's".into(), test));
     tests.push(("bad input is an error".into(), Box::new(bad_input)));
     for row in COMPONENTS {
