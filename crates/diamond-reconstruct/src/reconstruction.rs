@@ -340,7 +340,8 @@ impl Reconstruction {
     pub fn step(&mut self) -> Result<StepReport, ReconstructError> {
         self.fit_due_medium()?;
         self.make_pictures(&mut |_, _| ())?;
-        let plan = StepPlan::of(&self.config, self.step, self.engine.model()?.medium.is_some());
+        let photographs = self.engine.model()?.medium.is_some().then_some(self.pairs.len());
+        let plan = StepPlan::of(&self.config, self.step, photographs);
         let turns = self.turns();
         let batch = self.config.accumulate as u64;
         let mut loaded: Vec<Image> = Vec::with_capacity(batch as usize);

@@ -38,6 +38,10 @@ pub struct StepPlan {
     pub photometric: f32,
 }
 
+/// From so many photographs on materials learn at [`Subsurface::material_rate`](crate::Subsurface::material_rate). With fewer the rate falls with their root, as what
+/// a Gaussian can know of itself beside the noise of the pixels that see it does (decision 0030 has the figures for 9 and 384).
+const MANY_PHOTOGRAPHS: f32 = 400.0;
+
 /// Geometric interpolation from `a` to `b`; linear where one of them is 0.
 fn log_lerp(a: f32, b: f32, t: f32) -> f32 {
     let t = t.clamp(0.0, 1.0);
@@ -45,13 +49,14 @@ fn log_lerp(a: f32, b: f32, t: f32) -> f32 {
 }
 
 impl StepPlan {
-    /// The plan of `step` (0-based) under `config`, where a medium that it names has been found.
+    /// The plan of `step` (0-based) under `config`, where a medium that it names has been found and photographs are many.
     pub fn new(config: &Config, step: u64) -> Self {
-        Self::of(config, step, true)
+        Self::of(config, step, Some(usize::MAX))
     }
 
-    /// The plan of `step` for a model that has a medium or, although `config` may name one, has none: then everything learns at its own rate.
-    pub fn of(config: &Config, step: u64, medium: bool) -> Self {
+    /// The plan of `step` for a model that has a medium, learned from so many photographs, or, although `config` may name one, has none: then
+    /// everything learns at its own rate.
+    pub fn of(config: &Config, step: u64, medium: Option<usize>) -> Self {
         let fraction = step as f32 / config.steps as f32;
         let r = &config.rates;
         let s = &config.shading;
@@ -85,9 +90,12 @@ impl StepPlan {
             _ => (from / d.every_steps + 1) * d.every_steps,
         };
         let m = &config.subsurface;
-        let with_medium = medium && m.model.has_medium() && step >= at(m.from);
-        let (shape_rate, normal_rate, material_rate) =
-            if with_medium { (m.shape_rate, m.normal_rate, m.material_rate) } else { (1.0, 1.0, 1.0) };
+        let photographs = medium.filter(|_| m.model.has_medium() && step >= at(m.from));
+        let with_medium = photographs.is_some();
+        let (shape_rate, normal_rate, material_rate) = match photographs {
+            Some(n) => (m.shape_rate, m.normal_rate, m.material_rate * (n as f32 / MANY_PHOTOGRAPHS).sqrt().min(1.0)),
+            None => (1.0, 1.0, 1.0),
+        };
         let mut fits = std::iter::once(&m.from).chain(&m.refit);
         let comparing = done > at(c.from).max(first_round) && done <= at(c.until) && done.is_multiple_of(c.every_steps);
         Self {
@@ -156,9 +164,14 @@ mod tests {
         asked.subsurface.from = 0.1;
         for step in [0, 600, 1500, 9999] {
             let plain = StepPlan::new(&without, step);
-            assert_eq!(StepPlan { fit_medium: false, ..StepPlan::of(&asked, step, false) }, plain);
+            assert_eq!(StepPlan { fit_medium: false, ..StepPlan::of(&asked, step, None) }, plain);
+            assert_eq!(StepPlan::of(&without, step, Some(9)), plain);
             let planned = StepPlan::new(&asked, step);
             assert_eq!(planned.normal_factor < plain.normal_factor, step >= 1000, "{step}");
+            let few = StepPlan::of(&asked, step, Some(4));
+            let ratio = few.material_factor / planned.material_factor;
+            assert!((ratio - if step < 1000 { 1.0 } else { 0.1 }).abs() < 1e-6, "{step}: {ratio}");
+            assert_eq!(StepPlan { material_factor: planned.material_factor, ..few }, planned);
         }
     }
 

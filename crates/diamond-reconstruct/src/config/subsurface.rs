@@ -71,7 +71,7 @@ pub struct Subsurface {
     pub inset: f32,
     /// Their standard deviation along the surface, widths of the piece that each stands for.
     pub seed_width: f32,
-    /// Factor on the learning rates of materials, tints among them, once there is a medium.
+    /// Factor on the learning rates of materials, tints among them, once there is a medium, for 400 photographs or more; n < 400 have √(n / 400) of it.
     pub material_rate: f32,
     /// Pull of what the residual adds toward nothing, over the number of training views.
     pub residual_weight: f32,
@@ -93,7 +93,7 @@ impl Default for Subsurface {
             seed_width: 0.45,
             shape_rate: 0.3,
             normal_rate: 0.1,
-            material_rate: 0.03,
+            material_rate: 0.1,
             residual_weight: 3.0,
         }
     }
