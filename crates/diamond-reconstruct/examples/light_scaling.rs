@@ -36,20 +36,25 @@ struct Time {
     wall: f64,
 }
 
+fn once(f: &mut impl FnMut() -> Result<(), Failure>) -> Result<Time, Failure> {
+    let (start, processors) = (Instant::now(), processor_seconds());
+    f()?;
+    let wall = 1e3 * start.elapsed().as_secs_f64();
+    let processors = match (processors, processor_seconds()) {
+        (Some(before), Some(after)) => 1e3 * (after - before),
+        _ => wall,
+    };
+    Ok(Time { processors, wall })
+}
+
+fn median(mut times: Vec<Time>) -> Time {
+    let wall = times.iter().map(|t| t.wall).fold(f64::INFINITY, f64::min);
+    times.sort_by(|a, b| a.processors.total_cmp(&b.processors));
+    Time { processors: times[times.len() / 2].processors, wall }
+}
+
 fn time(mut f: impl FnMut() -> Result<(), Failure>) -> Result<Time, Failure> {
-    let (mut times, mut wall) = (Vec::new(), f64::INFINITY);
-    for _ in 0..REPETITIONS {
-        let (start, processors) = (Instant::now(), processor_seconds());
-        f()?;
-        let passed = start.elapsed().as_secs_f64();
-        wall = wall.min(1e3 * passed);
-        times.push(match (processors, processor_seconds()) {
-            (Some(before), Some(after)) => after - before,
-            _ => passed,
-        });
-    }
-    times.sort_by(f64::total_cmp);
-    Ok(Time { processors: 1e3 * times[REPETITIONS / 2], wall })
+    Ok(median((0..REPETITIONS).map(|_| once(&mut f)).collect::<Result<_, _>>()?))
 }
 
 /// `n` directions spread evenly over the sphere.
@@ -126,6 +131,24 @@ fn main() -> Result<(), Failure> {
     untraced.config.visibility.traced = false;
     let one = of(&untraced, 1)?;
     show(" fitted", 112, one, of(&untraced, 112)?);
+    if let Some(medium) = &model.medium {
+        // The lines above know what each light does in the medium; here that is computed as well, from a medium that has seen no light.
+        let new = |n: usize| {
+            let mut times = Vec::new();
+            for _ in 0..REPETITIONS {
+                let fresh = medium.with_medium(medium.medium().clone())?;
+                let model = Model { medium: Some(fresh), ..model.clone() };
+                times.push(once(&mut || {
+                    Ok(Renderer::new(&model)
+                        .each_radiance(&camera, &lights[..n], |_, _| Ok::<(), ReconstructError>(()))?)
+                })?);
+            }
+            Ok::<Time, Failure>(median(times))
+        };
+        let one = new(1)?;
+        show(" new", 1, one, one);
+        show(" new", 112, one, new(112)?);
+    }
     let maps = time(|| Ok(Renderer::new(&model).renderings(&camera, &lights[..1]).map(drop)?))?;
     println!("   1 light with all maps {:8.2} ms, wall {:8.2} ms", maps.processors, maps.wall);
     Ok(())

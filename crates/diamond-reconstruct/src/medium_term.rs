@@ -56,15 +56,6 @@ impl MediumRows {
     }
 }
 
-/// Where a Gaussian is, and how it is seen.
-pub(crate) struct MediumPlace {
-    pub gaussian: usize,
-    pub position: Vec3,
-    pub normal: Vec3,
-    /// See [`MediumTerm::toward`].
-    pub toward: Vec3,
-}
-
 /// The gradient that reaches the Gaussians of the rows.
 pub(crate) struct MediumRowsGrad {
     pub positions: Vec<Vec3>,
@@ -246,13 +237,9 @@ impl MediumTerm {
         let leaving = &self.leaving(&[*light])?[0];
         let lamp = light.of_unit_intensity();
         let untinted = (0..rows.len()).map(|row| {
-            let place = MediumPlace {
-                gaussian: rows.visible[row] as usize,
-                position: rows.positions[row],
-                normal: rows.normals[row],
-                toward: self.toward(rows.normals[row], rows.view_directions[row]),
-            };
-            self.untinted(&place, &lamp, leaving, lit.visibility[row])
+            let (gaussian, normal) = (rows.visible[row] as usize, rows.normals[row]);
+            let sent = self.sent_by(gaussian, rows.positions[row], normal, &lamp, leaving, lit.visibility[row]);
+            sent * self.toward(normal, rows.view_directions[row])
         });
         Ok(MediumRows { untinted: untinted.collect(), tints })
     }
@@ -263,13 +250,38 @@ impl MediumTerm {
         if falls > f32::MIN_POSITIVE { 1.0 / falls } else { 0.0 }
     }
 
-    /// What the medium sends out of a Gaussian under a lamp of intensity 1 with known surfels, over the lamp's falloff there and before the tint:
-    /// [eq:medium-residual] (Σ_j w_j·L_j·A(n·v)/falloff + local·visibility·max(0, n·l)/π)/s₀, linear RGB.
+    /// What the medium sends out of a Gaussian under a lamp of intensity 1 with known surfels, over the lamp's falloff there, before the tint and what depends
+    /// on the view: [eq:medium-residual] (Σ_j w_j·L_j/falloff + local·visibility·max(0, n·l)/π)/s₀, linear RGB. The view's factor A(n·v) is
+    /// of the first part alone; it differs from 1 for walks only, which have no second part.
     #[inline]
-    pub(crate) fn untinted(&self, at: &MediumPlace, lamp: &OlatLight, leaving: &[f32], visibility: f32) -> Vec3 {
-        let around = self.attachment.rgb(at.gaussian, leaving) * at.toward * self.over_falloff(lamp, at.position);
-        let cos_theta_i = at.normal.dot(lamp.incidence(at.position, Falloff::None).direction).max(0.0);
+    fn sent_by(
+        &self,
+        gaussian: usize,
+        position: Vec3,
+        normal: Vec3,
+        lamp: &OlatLight,
+        leaving: &[f32],
+        visibility: f32,
+    ) -> Vec3 {
+        let around = self.attachment.rgb(gaussian, leaving) * self.over_falloff(lamp, position);
+        let cos_theta_i = normal.dot(lamp.incidence(position, Falloff::None).direction).max(0.0);
         around * (1.0 / whole()) + self.local() * (visibility * cos_theta_i)
+    }
+
+    /// What the medium sends out of Gaussians (number, position, normal) under a lamp of intensity 1 over its falloff, before tint and [`MediumTerm::toward`], linear RGB.
+    /// `leaving` is the lamp's; visibility is 0 where there is none.
+    pub(crate) fn sent(
+        &self,
+        gaussians: impl Iterator<Item = (usize, Vec3, Vec3)>,
+        lamp: &OlatLight,
+        leaving: &[f32],
+        visibility: &[f32],
+    ) -> Vec<Vec3> {
+        let visibility = visibility.iter().copied().chain(std::iter::repeat(0.0));
+        gaussians
+            .zip(visibility)
+            .map(|((i, position, normal), v)| self.sent_by(i, position, normal, lamp, leaving, v))
+            .collect()
     }
 
     /// Pullback of [`MediumTerm::rows`] (tinted) to positions and normals, through what leaves where it enters, and to base colours. `d` is rows × 3.

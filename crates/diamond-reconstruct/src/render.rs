@@ -9,7 +9,6 @@
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
 use crate::forward::{Settings, raster_config};
-use crate::medium_term::MediumPlace;
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
@@ -44,9 +43,32 @@ pub struct Renderer<'m> {
     tracer: OnceLock<Tracer>,
     lights_together: usize,
     picture_bytes: usize,
-    /// Bytes of visibility that are kept from one view to the next.
+    /// Bytes of what is kept of lights from one view to the next.
     kept_bytes: usize,
-    kept: Mutex<BTreeMap<LightKey, Arc<Vec<f32>>>>,
+    kept: Mutex<BTreeMap<LightKey, Arc<LightHalf>>>,
+}
+
+/// What a light is to Gaussians, whatever the view.
+struct LightHalf {
+    /// Empty where nothing reads it.
+    visibility: Vec<f32>,
+    /// [`MediumTerm::sent`]; empty without a medium.
+    medium: Vec<Vec3>,
+}
+
+impl LightHalf {
+    /// Of `gaussians` Gaussians.
+    fn bytes(gaussians: usize, visibility: bool, medium: bool) -> usize {
+        gaussians * (usize::from(visibility) * size_of::<f32>() + usize::from(medium) * size_of::<Vec3>())
+    }
+
+    /// The same for some of the Gaussians.
+    fn of(&self, rows: &[u32]) -> Self {
+        Self {
+            visibility: rows.iter().filter_map(|&i| self.visibility.get(i as usize).copied()).collect(),
+            medium: rows.iter().filter_map(|&i| self.medium.get(i as usize).copied()).collect(),
+        }
+    }
 }
 
 /// What a view sees of the shape of a model.
@@ -274,7 +296,11 @@ impl<'m> Renderer<'m> {
         let transfer = transfer_config(model).filter(|_| self.needs.subsurface.needed);
         let transfer = transfer.map(|config| (rows.transfer.as_slice(), config));
         let tints = match &model.medium {
-            Some(_) if self.needs.subsurface.needed => MediumTerm::tints(&self.activated, &rows.visible),
+            Some(medium) if self.needs.subsurface.needed => {
+                let tints = MediumTerm::tints(&self.activated, &rows.visible);
+                let toward = rows.normals.iter().zip(&rows.view_directions).map(|(n, v)| medium.toward(*n, *v));
+                tints.into_iter().zip(toward).map(|(tint, toward)| tint * toward).collect()
+            }
             _ => Vec::new(),
         };
         let lit =
@@ -343,11 +369,7 @@ impl<'m> Renderer<'m> {
         shade: impl ShadeBlock<WIDTH>,
         Buffers { features, images }: &mut Buffers,
     ) -> Result<(), ReconstructError> {
-        let visibility: Vec<Vec<f32>> =
-            lights.par_iter().map(|light| self.visibility(view, light)).collect::<Result<_, _>>()?;
-        let lit: Vec<(OlatLight, &[f32])> =
-            lights.iter().zip(&visibility).map(|(light, v)| (*light, v.as_slice())).collect();
-        view.features(self.model.medium.as_ref(), &lit, features)?;
+        view.features(lights, &self.light_rows(view, lights)?, features)?;
         let features = features.as_slice();
         let lights: Vec<OlatLight> = lights.iter().map(|light| self.model.scene.scaled_light(light)).collect();
         images.resize_with(lights.len(), || Image::new(region.width, region.height, WIDTH));
@@ -376,42 +398,61 @@ impl<'m> Renderer<'m> {
         })
     }
 
-    /// Visibility of one light from the rows of a view; empty where nothing reads it.
-    fn visibility(&self, view: &ViewHalf, light: &OlatLight) -> Result<Vec<f32>, ReconstructError> {
-        if !self.needs.visibility.needed && view.channels.places.visibility.is_none() {
-            return Ok(Vec::new());
-        }
-        if !self.model.config.visibility.traced {
-            return Ok(LightRows::new(self.model, &view.rows, light, VisibilitySource::Fitted)?.visibility);
-        }
+    /// What each light is to the rows of a view, whatever is known of it from before.
+    fn light_rows(&self, view: &ViewHalf, lights: &[OlatLight]) -> Result<Vec<LightHalf>, ReconstructError> {
         let Activated { gaussians, normals, .. } = &self.activated;
-        // Without room for one more light what is kept stays: with more lights than that, each would push out the next.
-        let room = |kept: &BTreeMap<_, _>| (kept.len() + 1) * gaussians.len() * size_of::<f32>() <= self.kept_bytes;
-        let found = {
+        let rows = &view.rows.visible;
+        let seen = self.needs.visibility.needed || view.channels.places.visibility.is_some();
+        let traced = self.model.config.visibility.traced;
+        let medium = self.model.medium.as_ref().filter(|_| !view.tints.is_empty());
+        let found: Vec<Option<Arc<LightHalf>>> = {
             let kept = self.kept();
-            match kept.get(&key(light)) {
-                Some(found) => Some(Arc::clone(found)),
-                None if !room(&kept) => {
-                    return self.tracer()?.trace_rows(gaussians, normals, light, &view.rows.visible);
-                }
-                None => None,
-            }
+            lights.iter().map(|light| kept.get(&key(light)).cloned()).collect()
         };
-        let all = match found {
-            Some(all) => all,
-            None => {
-                let all = Arc::new(self.tracer()?.trace(gaussians, normals, light)?);
-                let mut kept = self.kept();
-                if room(&kept) {
-                    kept.insert(key(light), Arc::clone(&all));
-                }
-                all
-            }
+        let fresh: Vec<OlatLight> =
+            lights.iter().zip(&found).filter(|(_, found)| found.is_none()).map(|(light, _)| *light).collect();
+        let leaving = medium.map_or(Ok(Vec::new()), |medium| medium.leaving(&fresh))?;
+        let leaving: BTreeMap<LightKey, _> = fresh.iter().map(key).zip(leaving).collect();
+        // Without room for one more light what is kept stays: with more lights than that, each would push out the next.
+        let bytes = LightHalf::bytes(gaussians.len(), seen, medium.is_some());
+        let room = |kept: &BTreeMap<_, _>| (kept.len() + 1) * bytes <= self.kept_bytes;
+        let half = |light: &OlatLight, leaving: Option<&[f32]>, of: &[u32]| -> Result<LightHalf, ReconstructError> {
+            let visibility = match (seen, traced) {
+                (false, _) => Vec::new(),
+                (true, false) => LightRows::new(self.model, &view.rows, light, VisibilitySource::Fitted)?.visibility,
+                (true, true) => self.tracer()?.trace_rows(gaussians, normals, light, of)?,
+            };
+            let medium = medium.zip(leaving).map_or(Vec::new(), |(medium, leaving)| {
+                let places = of.iter().map(|&i| (i as usize, gaussians.means[i as usize], normals[i as usize]));
+                medium.sent(places, &light.of_unit_intensity(), leaving, &visibility)
+            });
+            Ok(LightHalf { visibility, medium })
         };
-        Ok(view.rows.visible.iter().map(|&i| all[i as usize]).collect())
+        lights
+            .par_iter()
+            .zip(found)
+            .map(|(light, found)| -> Result<LightHalf, ReconstructError> {
+                let leaving = leaving.get(&key(light)).map(|leaving| leaving.as_slice());
+                let all = match found {
+                    Some(all) => all,
+                    // Fitted visibility is that of a view's rows.
+                    None if (seen && !traced) || !room(&self.kept()) => return half(light, leaving, rows),
+                    None => {
+                        let every: Vec<u32> = (0..gaussians.len() as u32).collect();
+                        let all = Arc::new(half(light, leaving, &every)?);
+                        let mut kept = self.kept();
+                        if room(&kept) {
+                            kept.insert(key(light), Arc::clone(&all));
+                        }
+                        all
+                    }
+                };
+                Ok(all.of(rows))
+            })
+            .collect()
     }
 
-    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Arc<Vec<f32>>>> {
+    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Arc<LightHalf>>> {
         // Whoever panicked with the lock held left whole entries behind.
         self.kept.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }
@@ -477,7 +518,7 @@ struct ViewHalf {
     weights: BlendWeights,
     /// Of the Gaussians that pass something to a pixel.
     rows: Rows,
-    /// Their tints, where there is a medium.
+    /// Their tints times what depends on the view in what the medium sends out, where there is one.
     tints: Vec<Vec3>,
     /// The same, ready for lights.
     lit: LitRows,
@@ -519,13 +560,12 @@ impl ViewHalf {
     /// The channels of all `lights`, row by row.
     fn features(
         &self,
-        medium: Option<&MediumTerm>,
-        lights: &[(OlatLight, &[f32])],
+        lights: &[OlatLight],
+        halves: &[LightHalf],
         features: &mut Vec<f32>,
     ) -> Result<(), ReconstructError> {
-        let lamps: Vec<OlatLight> = lights.iter().map(|(light, _)| light.of_unit_intensity()).collect();
-        let medium = medium.filter(|_| !self.tints.is_empty());
-        let leaving = medium.map_or(Ok(Vec::new()), |medium| medium.leaving(&lamps))?;
+        let lit: Vec<(OlatLight, &[f32])> =
+            lights.iter().zip(halves).map(|(light, half)| (*light, half.visibility.as_slice())).collect();
         let width = self.channels.per_light * lights.len();
         features.resize(self.rows.len() * width, 0.0);
         // Asked here: the setting belongs to the thread that called.
@@ -536,19 +576,13 @@ impl ViewHalf {
             let put = |row: usize, values: &[f32]| {
                 let to = &mut piece[(row - first) * width..][..width];
                 to.copy_from_slice(values);
-                let (Some(medium), Some(at)) = (medium, self.channels.places.residual) else { return };
-                let (position, normal) = (self.rows.positions[row], self.rows.normals[row]);
-                let gaussian = self.rows.visible[row] as usize;
-                let toward = medium.toward(normal, self.rows.view_directions[row]);
-                let place = MediumPlace { gaussian, position, normal, toward };
-                let lit = lights.iter().zip(&lamps).zip(&leaving);
-                for (to, ((light, lamp), leaving)) in to.chunks_exact_mut(self.channels.per_light).zip(lit) {
-                    let visibility = light.1.get(row).copied().unwrap_or(0.0);
-                    let rgb = medium.untinted(&place, lamp, leaving, visibility) * self.tints[row];
+                let (Some(tint), Some(at)) = (self.tints.get(row), self.channels.places.residual) else { return };
+                for (to, half) in to.chunks_exact_mut(self.channels.per_light).zip(halves) {
+                    let rgb = half.medium[row] * *tint;
                     to[at..at + 3].iter_mut().zip(rgb.to_array()).for_each(|(o, v)| *o += v);
                 }
             };
-            self.lit.task(task, level, lights, &self.channels, put).map_err(error::stage("residual network"))
+            self.lit.task(task, level, &lit, &self.channels, put).map_err(error::stage("residual network"))
         })
     }
 }
