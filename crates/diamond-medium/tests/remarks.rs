@@ -72,7 +72,7 @@ fn remarks(material: Material, paint: impl Fn(Vec3) -> f32) -> (Medium, Vec<Stri
 }
 
 fn matched(sigma_t: f32, albedo: Vec3) -> Material {
-    Material::index_matched(diamond_pathtrace::Medium { sigma_t: Vec3::splat(sigma_t), albedo, g: 0.0 })
+    Material::index_matched(diamond_pathtrace::Medium { sigma_t: Vec3::splat(sigma_t), albedo, g: 0.0, veins: None })
 }
 
 const WAX: Vec3 = Vec3::new(0.99, 0.95, 0.85);

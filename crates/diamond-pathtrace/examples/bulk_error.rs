@@ -31,15 +31,25 @@ fn material(name: &str) -> Result<Material, String> {
     let matched = |medium| Material { medium, boundary: Boundary::IndexMatched, coat };
     Ok(match name {
         "jade" => Material {
-            medium: Medium { sigma_t: Vec3::new(14.0, 10.0, 16.0), albedo: Vec3::new(0.95, 0.985, 0.94), g: 0.0 },
+            medium: Medium {
+                sigma_t: Vec3::new(14.0, 10.0, 16.0),
+                albedo: Vec3::new(0.95, 0.985, 0.94),
+                g: 0.0,
+                veins: None,
+            },
             boundary: Boundary::Rough { eta: 1.5, alpha: 0.2 },
             coat: None,
         },
-        "wax" => matched(Medium { sigma_t: Vec3::splat(40.0), albedo: Vec3::new(0.998, 0.99, 0.96), g: 0.0 }),
-        "skin" => {
-            matched(Medium { sigma_t: Vec3::new(25.0, 35.0, 55.0), albedo: Vec3::new(0.995, 0.98, 0.96), g: 0.8 })
+        "wax" => {
+            matched(Medium { sigma_t: Vec3::splat(40.0), albedo: Vec3::new(0.998, 0.99, 0.96), g: 0.0, veins: None })
         }
-        "thin" => matched(Medium { sigma_t: Vec3::splat(4.0), albedo: Vec3::new(0.99, 0.9, 0.6), g: 0.3 }),
+        "skin" => matched(Medium {
+            sigma_t: Vec3::new(25.0, 35.0, 55.0),
+            albedo: Vec3::new(0.995, 0.98, 0.96),
+            g: 0.8,
+            veins: None,
+        }),
+        "thin" => matched(Medium { sigma_t: Vec3::splat(4.0), albedo: Vec3::new(0.99, 0.9, 0.6), g: 0.3, veins: None }),
         _ => return Err(format!("no medium {name}; there are jade, wax, skin, thin")),
     })
 }

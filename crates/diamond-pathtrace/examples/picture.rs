@@ -65,7 +65,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let word = |i: usize, default: &str| arguments.get(i).cloned().unwrap_or_else(|| default.to_string());
     let out = arguments.first().ok_or("usage: picture OUT.png [OBJECT] [SIDE] [PATHS]")?;
     let (side, samples): (u32, u32) = (word(2, "192").parse()?, word(3, "128").parse()?);
-    let medium = Medium { sigma_t: Vec3::new(6.0, 9.0, 14.0), albedo: Vec3::new(0.995, 0.98, 0.93), g: 0.4 };
+    let medium =
+        Medium { sigma_t: Vec3::new(6.0, 9.0, 14.0), albedo: Vec3::new(0.995, 0.98, 0.93), g: 0.4, veins: None };
     let coat = Some(Coat { roughness: 0.25, f0: Vec3::splat(0.04) });
     let lamp = |direction: Vec3| Light::directional(direction.normalize(), Vec3::splat(3.0));
     let scene = Scene {

@@ -167,7 +167,7 @@ fn read_material(material: &gltf::Material) -> Result<(Coat, Option<Material>), 
     }
     let alpha = coat.roughness * coat.roughness;
     let boundary = if alpha < ggx::MIN_ALPHA { Boundary::Smooth { eta } } else { Boundary::Rough { eta, alpha } };
-    let medium = Medium { sigma_t, albedo, g: mean_cosine };
+    let medium = Medium { sigma_t, albedo, g: mean_cosine, veins: None };
     let found = Material { medium, boundary: boundary.effective(), coat: None };
     found.validate().map_err(|e| e.to_string())?;
     Ok((coat, Some(found)))

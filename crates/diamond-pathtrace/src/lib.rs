@@ -58,6 +58,7 @@ pub mod sampling;
 mod scene;
 mod sobol;
 mod triangle;
+mod veins;
 mod view_walks;
 
 pub use boundary::{Boundary, BoundarySample};
@@ -84,4 +85,5 @@ pub use repair::{RepairOptions, RepairReport};
 pub use rng::Rng;
 pub use sampling::Frame;
 pub use scene::{Material, Scene};
+pub use veins::Veins;
 pub use view_walks::{RadianceMoments, ViewWalkOptions, ViewWalks, WalkStart};

@@ -1,4 +1,4 @@
-//! Homogeneous participating media: how far light flies, what is left of it, and where it is scattered.
+//! Participating media of one extinction: how far light flies, what is left of it, and where it is scattered.
 //!
 //! Along a ray inside a medium light is lost at the rate σ_t; of what is lost the fraction `albedo` continues in a direction
 //! that the Henyey–Greenstein function draws. σ_t and albedo are per channel, the mean cosine is one number.
@@ -7,14 +7,14 @@
 //! channels. This is one-sample multiple importance sampling (Veach), and the weight is bounded by the number of channels
 //! whatever the ratio of their σ_t.
 use crate::error::{PathtraceError, check, check_rgb};
-use crate::{Frame, Rng};
+use crate::{Frame, Rng, Veins};
 use glam::Vec3;
 use std::f32::consts::{PI, TAU};
 
 /// Largest |g|: beyond it the phase function's peak is narrower than `f32` directions resolve.
 pub const MAX_MEAN_COSINE: f32 = 0.999;
 
-/// A homogeneous medium.
+/// A medium of one extinction, homogeneous but for veins.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Medium {
     /// Extinction coefficient per channel, 1/scene unit, ≥ 0.
@@ -23,12 +23,14 @@ pub struct Medium {
     pub albedo: Vec3,
     /// Mean cosine of the Henyey–Greenstein phase function, −0.999 … 0.999; > 0 scatters forward.
     pub g: f32,
+    /// Where its albedo is lower; nowhere without.
+    pub veins: Option<Veins>,
 }
 
 /// How a flight through a medium ended, and the factor by which the path's throughput changes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Flight {
-    /// It was scattered at the distance; the weight includes the albedo.
+    /// It was scattered at the distance; the weight includes the albedo, but not what veins take off it there.
     Scattered {
         /// Distance from the start, scene units.
         distance: f32,
@@ -54,7 +56,7 @@ pub struct FreeFlight {
 impl Medium {
     /// A medium that treats all channels alike.
     pub fn gray(sigma_t: f32, albedo: f32, g: f32) -> Self {
-        Self { sigma_t: Vec3::splat(sigma_t), albedo: Vec3::splat(albedo), g }
+        Self { sigma_t: Vec3::splat(sigma_t), albedo: Vec3::splat(albedo), g, veins: None }
     }
 
     /// `Err` where a number is outside its range.
@@ -63,7 +65,8 @@ impl Medium {
             (0.0..=1e9).contains(&v)
         })?;
         check_rgb("albedo of a medium", self.albedo, "a number from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
-        check("g of a medium", self.g, "a number from −0.999 to 0.999", |v| v.abs() <= MAX_MEAN_COSINE)
+        check("g of a medium", self.g, "a number from −0.999 to 0.999", |v| v.abs() <= MAX_MEAN_COSINE)?;
+        self.veins.map_or(Ok(()), |veins| veins.validate())
     }
 
     /// What is left of light after `distance` (scene units, ≥ 0) in the medium.

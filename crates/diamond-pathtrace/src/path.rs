@@ -195,8 +195,8 @@ impl<'a> Tracer<'a> {
         }
         match self.medium.arrive(flight, length) {
             Flight::Scattered { distance, weight } => {
-                p.throughput *= weight;
                 p.origin += p.direction * distance;
+                p.throughput *= weight * self.medium.variation(p.origin);
                 p.skip = NO_PRIMITIVE;
                 // Written so that NaN fails it. A path that rounding has brought outside at an edge ends here.
                 let within = p.origin.cmpge(self.bounds.0).all() && p.origin.cmple(self.bounds.1).all();

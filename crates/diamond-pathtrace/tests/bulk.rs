@@ -3,7 +3,7 @@ use diamond_camera::{Camera, Intrinsics, Pose};
 use diamond_light::LightRig;
 use diamond_pathtrace::{
     Boundary, Bulk, BulkError, BulkOptions, Coat, Geometry, Light, Material, Medium, Mesh, PathtraceError,
-    ReferenceOptions, Scene, measure_bulk, reference_pairs, render_reference,
+    ReferenceOptions, Scene, Veins, measure_bulk, reference_pairs, render_reference,
 };
 use glam::Vec3;
 
@@ -47,7 +47,7 @@ fn assert_small(error: &BulkError, rmse: f64) {
 
 #[test]
 fn an_index_matched_sphere_agrees_with_the_reference() {
-    let medium = Medium { sigma_t: Vec3::new(5.0, 8.0, 12.0), albedo: Vec3::new(0.95, 0.9, 0.8), g: 0.0 };
+    let medium = Medium { sigma_t: Vec3::new(5.0, 8.0, 12.0), albedo: Vec3::new(0.95, 0.9, 0.8), g: 0.0, veins: None };
     let scene = Scene { geometry: sphere(), material: Material::index_matched(medium), lights: lamps(&OBLIQUE) };
     let options = BulkOptions { points: 800, walks: 400, connections: 1.0, samples_per_axis: 8, ..Default::default() };
     assert_small(&measured(&scene, &options, 14, 1500), 0.1);
@@ -56,7 +56,7 @@ fn an_index_matched_sphere_agrees_with_the_reference() {
 /// `[eq:single-scattering]`: of a thin, dark object hardly anything else is seen.
 #[test]
 fn a_dented_ball_with_forward_scattering_and_a_coat_agrees_with_the_reference() {
-    let medium = Medium { sigma_t: Vec3::new(4.0, 6.0, 9.0), albedo: Vec3::new(0.7, 0.6, 0.4), g: 0.6 };
+    let medium = Medium { sigma_t: Vec3::new(4.0, 6.0, 9.0), albedo: Vec3::new(0.7, 0.6, 0.4), g: 0.6, veins: None };
     let coat = Some(Coat { roughness: 0.5, f0: Vec3::splat(0.05) });
     let material = Material { medium, boundary: Boundary::IndexMatched, coat };
     let scene = Scene { geometry: dented(), material, lights: lamps(&OBLIQUE) };
@@ -64,9 +64,31 @@ fn a_dented_ball_with_forward_scattering_and_a_coat_agrees_with_the_reference() 
     assert_small(&measured(&scene, &options, 14, 1500), 0.2);
 }
 
+/// `[eq:veins]`: in both media of the bulk renderer, and not what the same medium without veins sends out.
+#[test]
+fn a_veined_sphere_agrees_with_the_reference() {
+    let veins = Some(Veins { frequency: 1.5, width: 0.3, factor: Vec3::new(0.5, 0.7, 0.9), seed: 4 });
+    let medium = Medium { sigma_t: Vec3::new(5.0, 8.0, 12.0), albedo: Vec3::new(0.98, 0.95, 0.9), g: 0.0, veins };
+    for (boundary, rmse) in [(Boundary::IndexMatched, 0.12), (Boundary::Rough { eta: 1.4, alpha: 0.6 }, 0.17)] {
+        let material = Material { medium, boundary, coat: None };
+        let scene = Scene { geometry: sphere(), material, lights: lamps(&OBLIQUE) };
+        let options = BulkOptions { points: 600, walks: 400, connections: 1.0, ..Default::default() };
+        assert_small(&measured(&scene, &options, 10, 2000), rmse);
+        let mean = |scene: &Scene| -> f64 {
+            let bulk = Bulk::solve(scene, &options, &|_| ()).unwrap();
+            let view = bulk.render(&camera(Vec3::new(3.0, 1.0, 0.5), 10), 4).unwrap();
+            view.lights.iter().map(|image| f64::from(image.mean())).sum()
+        };
+        let mut plain = scene.clone();
+        plain.material.medium.veins = None;
+        let (with, without) = (mean(&scene), mean(&plain));
+        assert!(with < 0.8 * without, "{with} {without}");
+    }
+}
+
 #[test]
 fn a_refracting_sphere_agrees_with_the_reference() {
-    let medium = Medium { sigma_t: Vec3::new(6.0, 9.0, 14.0), albedo: Vec3::new(0.97, 0.9, 0.8), g: 0.0 };
+    let medium = Medium { sigma_t: Vec3::new(6.0, 9.0, 14.0), albedo: Vec3::new(0.97, 0.9, 0.8), g: 0.0, veins: None };
     let material = Material { medium, boundary: Boundary::Rough { eta: 1.4, alpha: 0.6 }, coat: None };
     let scene = Scene { geometry: sphere(), material, lights: lamps(&OBLIQUE) };
     let options = BulkOptions { points: 500, walks: 500, ..Default::default() };
@@ -129,7 +151,8 @@ fn a_white_object_does_not_exceed_the_furnace() {
 #[test]
 fn bits_depend_neither_on_threads_nor_on_the_other_lights() {
     for boundary in [Boundary::IndexMatched, Boundary::Rough { eta: 1.5, alpha: 0.3 }] {
-        let medium = Medium { sigma_t: Vec3::new(4.0, 6.0, 9.0), albedo: Vec3::new(0.9, 0.8, 0.7), g: 0.4 };
+        let medium =
+            Medium { sigma_t: Vec3::new(4.0, 6.0, 9.0), albedo: Vec3::new(0.9, 0.8, 0.7), g: 0.4, veins: None };
         let coat = Some(Coat { roughness: 0.4, f0: Vec3::splat(0.04) });
         let material = Material { medium, boundary, coat };
         let scene = Scene { geometry: dented(), material, lights: lamps(&OBLIQUE) };

@@ -71,7 +71,7 @@ fn extreme_bulk_scenes_stay_finite() {
                 for albedo in albedos {
                     for g in [-0.99, 0.99] {
                         let coat = Some(Coat { roughness: 0.0, f0: Vec3::splat(0.04) });
-                        let material = Material { medium: Medium { sigma_t, albedo, g }, boundary, coat };
+                        let material = Material { medium: Medium { sigma_t, albedo, g, veins: None }, boundary, coat };
                         let scene = Scene { geometry: geometry.clone(), material, lights: lamps() };
                         // Without maps every way is a ray.
                         let visibility = if s % 2 == 0 { 8 } else { 0 };

@@ -53,9 +53,10 @@ fn average(scene: &Scene, paths: u32, mut ray: impl FnMut(&mut Rng) -> (Vec3, Ve
 fn a_white_object_disappears_in_the_furnace() {
     for geometry in meshes().into_iter().chain([sphere()]) {
         for boundary in [Boundary::IndexMatched, Boundary::Smooth { eta: 1.4 }] {
-            for medium in
-                [Medium::gray(3.0, 1.0, 0.3), Medium { sigma_t: Vec3::new(1.0, 4.0, 9.0), albedo: Vec3::ONE, g: 0.0 }]
-            {
+            for medium in [
+                Medium::gray(3.0, 1.0, 0.3),
+                Medium { sigma_t: Vec3::new(1.0, 4.0, 9.0), albedo: Vec3::ONE, g: 0.0, veins: None },
+            ] {
                 let chromatic = medium.sigma_t.x != medium.sigma_t.y;
                 let material = Material { medium, boundary, coat: None };
                 let scene = Scene { geometry: geometry.clone(), material, lights: vec![furnace()] };
@@ -155,7 +156,7 @@ fn roulette_keeps_the_mean_near_white() {
 #[test]
 fn threads_do_not_change_a_bit() {
     let material = Material {
-        medium: Medium { sigma_t: Vec3::new(2.0, 3.0, 5.0), albedo: Vec3::splat(0.9), g: 0.4 },
+        medium: Medium { sigma_t: Vec3::new(2.0, 3.0, 5.0), albedo: Vec3::splat(0.9), g: 0.4, veins: None },
         boundary: Boundary::Rough { eta: 1.3, alpha: 0.3 },
         coat: Some(Coat { roughness: 0.3, f0: Vec3::splat(0.04) }),
     };

@@ -153,7 +153,8 @@ fn a_chromatic_picture_is_three_monochrome_ones() {
         pose: Pose::look_at(Vec3::new(0.0, 0.8, 3.9), Vec3::ZERO, Vec3::Y),
     };
     for boundary in [Boundary::IndexMatched, Boundary::Rough { eta: 1.4, alpha: 0.4 }] {
-        let medium = Medium { sigma_t: Vec3::new(1.0, 4.0, 20.0), albedo: Vec3::new(0.97, 0.9, 0.8), g: 0.4 };
+        let medium =
+            Medium { sigma_t: Vec3::new(1.0, 4.0, 20.0), albedo: Vec3::new(0.97, 0.9, 0.8), g: 0.4, veins: None };
         let render = |medium: Medium, seed: u64| {
             let scene = Scene {
                 geometry: Geometry::Sphere { centre: Vec3::ZERO, radius: 1.0 },

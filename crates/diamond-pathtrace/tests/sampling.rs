@@ -212,7 +212,7 @@ fn a_wrong_density_is_noticed() {
 /// is scattered with its albedo.
 #[test]
 fn chromatic_flights_keep_every_channel() {
-    let medium = Medium { sigma_t: Vec3::new(0.5, 2.0, 8.0), albedo: Vec3::new(0.9, 0.5, 1.0), g: 0.0 };
+    let medium = Medium { sigma_t: Vec3::new(0.5, 2.0, 8.0), albedo: Vec3::new(0.9, 0.5, 1.0), g: 0.0, veins: None };
     let throughput = Vec3::new(0.2, 1.0, 0.7);
     let (mut rng, n) = (Rng::new(2, 7), 400_000);
     let mut passed = [0; 2].map(|_| (Vec3::ZERO.as_dvec3(), Vec3::ZERO.as_dvec3()));

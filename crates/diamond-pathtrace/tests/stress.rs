@@ -70,7 +70,7 @@ fn extreme_scenes_stay_finite() {
                 for albedo in albedos {
                     for g in [-0.99, 0.0, 0.99] {
                         let coat = Some(Coat { roughness: 0.0, f0: Vec3::splat(0.04) });
-                        let material = Material { medium: Medium { sigma_t, albedo, g }, boundary, coat };
+                        let material = Material { medium: Medium { sigma_t, albedo, g, veins: None }, boundary, coat };
                         let mut lights = lamps();
                         if matches!(boundary, Boundary::Smooth { .. }) {
                             lights.retain(|light| !light.is_delta());

@@ -34,7 +34,7 @@ fn best_albedo(exponents: &[f32], h: &[f32], truth: &[f32]) -> (f32, f64) {
 #[test]
 fn a_medium_is_found_from_pictures() {
     let geometry = Geometry::from_mesh(Mesh::icosphere(Vec3::ZERO, 1.0, 4)).unwrap();
-    let truth = Medium { sigma_t: Vec3::splat(8.0), albedo: Vec3::new(0.98, 0.9, 0.6), g: 0.0 };
+    let truth = Medium { sigma_t: Vec3::splat(8.0), albedo: Vec3::new(0.98, 0.9, 0.6), g: 0.0, veins: None };
     let lights: Vec<Light> = [Vec3::new(0.3, 0.4, 1.0), Vec3::new(1.0, 0.3, -0.4)]
         .map(|d| Light::directional(d.normalize(), Vec3::ONE))
         .to_vec();

@@ -26,6 +26,6 @@ pub use object::Object;
 pub use plan::{Plan, PlannedView};
 pub use recipe::{
     BoundaryRecipe, CoatRecipe, FilmRecipe, HeldOutRecipe, MaterialRecipe, NoiseRecipe, ObjectRecipe, Part,
-    QualityRecipe, Recipe, RigKind, RigRecipe, SolidRecipe, UpAxis,
+    QualityRecipe, Recipe, RigKind, RigRecipe, SolidRecipe, UpAxis, VeinsRecipe,
 };
 pub use shards::{ShardEntry, ShardIndex, ShardOptions, export_shards};

@@ -3,7 +3,7 @@
 //! Lengths are scene units with the object inside the unit ball about the origin and z up; angles are degrees. A recipe
 //! and its files determine every byte of the capture.
 use crate::{SynthError, changed_table};
-use diamond_pathtrace::{Boundary, Coat, DistanceField, Material, Medium, Operation, Solid, SurfaceNoise};
+use diamond_pathtrace::{Boundary, Coat, DistanceField, Material, Medium, Operation, Solid, SurfaceNoise, Veins};
 use glam::{EulerRot, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -196,6 +196,24 @@ pub struct MaterialRecipe {
     /// A glossy reflection on top.
     #[serde(default)]
     pub coat: Option<CoatRecipe>,
+    /// Sheets in which the medium absorbs more; without them it is the same everywhere.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub veins: Option<VeinsRecipe>,
+}
+
+/// Sheets in which a medium absorbs more, see [`diamond_pathtrace::Veins`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VeinsRecipe {
+    /// Cells of the noise per scene unit.
+    pub frequency: f32,
+    /// Noise of this size (of about 1) is half out of a vein.
+    pub width: f32,
+    /// Factor on the albedo in the middle of a vein, per channel, 0 to 1.
+    pub factor: [f32; 3],
+    /// Which noise.
+    #[serde(default)]
+    pub seed: u64,
 }
 
 /// The boundary to the air.
@@ -390,7 +408,13 @@ impl NoiseRecipe {
 impl MaterialRecipe {
     /// As the renderer wants it.
     pub fn material(&self) -> Material {
-        let medium = Medium { sigma_t: self.sigma_t.into(), albedo: self.albedo.into(), g: self.g };
+        let veins = self.veins.map(|VeinsRecipe { frequency, width, factor, seed }| Veins {
+            frequency,
+            width,
+            factor: factor.into(),
+            seed,
+        });
+        let medium = Medium { sigma_t: self.sigma_t.into(), albedo: self.albedo.into(), g: self.g, veins };
         let boundary = match self.boundary {
             BoundaryRecipe::Matched => Boundary::IndexMatched,
             BoundaryRecipe::Smooth { eta } => Boundary::Smooth { eta },

@@ -60,7 +60,7 @@ impl Case {
             .sum();
         let patches = mesh.patches(area as f32 / surfels).map_err(|e| e.to_string())?;
         let geometry = Geometry::from_mesh(mesh).map_err(|e| e.to_string())?;
-        let medium = Medium { sigma_t: Vec3::splat(sigma_t), albedo: ALBEDO, g };
+        let medium = Medium { sigma_t: Vec3::splat(sigma_t), albedo: ALBEDO, g, veins: None };
         let lights = LAMPS.iter().map(|d| Light::directional(d.normalize(), Vec3::splat(3.0))).collect();
         let scene = Scene { geometry, material: Material { medium, boundary, coat: None }, lights };
         let eye = if matches!(name, "slab" | "sheet") { Vec3::new(1.6, 1.2, 2.9) } else { Vec3::new(0.8, 0.7, 3.3) };

@@ -28,7 +28,8 @@ fn scene() -> Result<Scene, String> {
     }
     mesh.normals = None;
     let rig = LightRig::dome(8, Vec3::ZERO, Vec3::Y, 4.5, -0.6, Vec3::ONE).map_err(|e| e.to_string())?;
-    let medium = Medium { sigma_t: Vec3::new(8.0, 12.0, 18.0), albedo: Vec3::new(0.99, 0.95, 0.8), g: 0.4 };
+    let medium =
+        Medium { sigma_t: Vec3::new(8.0, 12.0, 18.0), albedo: Vec3::new(0.99, 0.95, 0.8), g: 0.4, veins: None };
     Ok(Scene {
         geometry: Geometry::from_mesh(mesh.with_smooth_normals()).map_err(|e| e.to_string())?,
         material: Material::index_matched(medium),

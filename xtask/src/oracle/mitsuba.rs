@@ -75,6 +75,7 @@ pub fn read_scene(folder: &Path, json: &Value) -> Result<(Scene, Camera), String
         sigma_t: three(field(json, "sigma_t")?, "sigma_t")?,
         albedo: three(field(json, "albedo")?, "albedo")?,
         g: number(field(json, "g")?, "g")?,
+        veins: None,
     };
     let light = if let Some(travel) = json.get("light_travel_direction_unnormalised") {
         let direction = -three(travel, "light_travel_direction_unnormalised")?.normalize();

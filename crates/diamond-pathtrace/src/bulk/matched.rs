@@ -182,8 +182,8 @@ impl MatchedWalks<'_> {
         let Some(end) = leaving else { return false };
         let channel = ((3.0 * rng.uniform()) as usize).min(2);
         let (distance, weight) = forced_flight(medium.sigma_t, end.distance, channel, rng.uniform());
-        let mut throughput = weight * medium.albedo;
         let mut origin = point.position + direction * distance;
+        let mut throughput = weight * medium.albedo * medium.variation(origin);
         let mut direction = sample_henyey_greenstein(medium.g, direction, rng);
         let mut skip = NO_PRIMITIVE;
         let (low, high) = geometry.bounds();
@@ -202,8 +202,8 @@ impl MatchedWalks<'_> {
             };
             match medium.arrive(flight, hit.map_or(f32::INFINITY, |hit| hit.distance)) {
                 Flight::Scattered { distance, weight } => {
-                    throughput *= weight;
                     origin += direction * distance;
+                    throughput *= weight * medium.variation(origin);
                     skip = NO_PRIMITIVE;
                     let within = origin.cmpge(low).all() && origin.cmple(high).all();
                     if !within || throughput.max_element() <= 0.0 {

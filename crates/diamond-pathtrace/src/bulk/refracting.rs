@@ -240,8 +240,8 @@ impl<'a> RefractingWalks<'a> {
             };
             match medium.arrive(flight, hit.map_or(f32::INFINITY, |hit| hit.distance)) {
                 Flight::Scattered { distance, weight } => {
-                    throughput *= weight;
                     origin += direction * distance;
+                    throughput *= weight * medium.variation(origin);
                     skip = NO_PRIMITIVE;
                     let within = origin.cmpge(low).all() && origin.cmple(high).all();
                     if !within || throughput.max_element() <= 0.0 {

@@ -337,7 +337,7 @@ impl Gather<'_, HEMISPHERE> {
             self.sequence -= self.sequence.floor();
             let (distance, ratio) = forced_flight_quantile(medium.sigma_t, length, self.sequence);
             let at = hit.position + direction * distance;
-            let weight = weight * ratio * medium.albedo / PLACES as f32;
+            let weight = weight * ratio * medium.albedo * medium.variation(at) / PLACES as f32;
             let mut ways = std::mem::take(&mut self.ways);
             bulk.maps.look_up(&bulk.lamps, at, &mut ways);
             for (l, (shine, inside)) in ways.shines.iter().zip(&ways.lengths).enumerate() {
