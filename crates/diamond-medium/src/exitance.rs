@@ -127,15 +127,17 @@ impl Exitance {
         rings
     }
 
-    /// Factor on the radiance of a surfel toward the outer cosine `mu`, 0 … 1: linear RGB; 1 for profiles.
+    /// Factor on the radiance of a surfel toward the outer cosine `mu`, −1 … 1: linear RGB; 1 for profiles in front. Nothing leaves toward the inside: what is seen from behind, through
+    /// gaps between Gaussians, falls to 0 with 1 + mu, slowly, since normals are not exact.
     #[inline]
     pub fn toward(&self, mu: f32) -> Vec3 {
+        let front = (1.0 + mu).clamp(0.0, 1.0);
         match &self.form {
-            Form::Profile { .. } => Vec3::ONE,
+            Form::Profile { .. } => Vec3::splat(front),
             Form::Walk { operators, .. } => {
                 // Seen at the very edge as if a little before it, so that no normal turns a Gaussian black.
                 let mu = mu.max(MIN_COS_THETA_O);
-                Vec3::from(std::array::from_fn(|c| operators[c].angular.at(mu)))
+                front * Vec3::from(std::array::from_fn(|c| operators[c].angular.at(mu)))
             }
         }
     }

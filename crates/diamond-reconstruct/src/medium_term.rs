@@ -252,7 +252,7 @@ impl MediumTerm {
 
     /// What the medium sends out of a Gaussian under a lamp of intensity 1 with known surfels, over the lamp's falloff there, before the tint and what depends
     /// on the view: [eq:medium-residual] (Σ_j w_j·L_j/falloff + local·visibility·max(0, n·l)/π)/s₀, linear RGB. The view's factor A(n·v) is
-    /// of the first part alone; it differs from 1 for walks only, which have no second part.
+    /// of both: toward the front it differs from 1 for walks only, which have no second part, and from behind less of anything is seen.
     #[inline]
     fn sent_by(
         &self,
@@ -284,7 +284,8 @@ impl MediumTerm {
             .collect()
     }
 
-    /// Pullback of [`MediumTerm::rows`] (tinted) to positions and normals, through what leaves where it enters, and to base colours. `d` is rows × 3.
+    /// Pullback of [`MediumTerm::rows`] (tinted) to positions and normals, through what leaves where it enters, and to base colours. `d` is rows × 3. The
+    /// view's factor is a weight that no gradient goes through.
     pub(crate) fn pull(
         &self,
         rows: &Rows,
@@ -303,8 +304,8 @@ impl MediumTerm {
         }
         // All channels see the same scalar irradiance; the cotangent goes to the first.
         // [eq:medium-residual]
-        let d_own: Vec<f32> =
-            (0..rows.len()).flat_map(|row| [(rgb(row) * medium.tints[row]).dot(local), 0.0, 0.0]).collect();
+        let sent = |row: usize| medium.tints[row] * self.toward(rows.normals[row], rows.view_directions[row]);
+        let d_own: Vec<f32> = (0..rows.len()).flat_map(|row| [(rgb(row) * sent(row)).dot(local), 0.0, 0.0]).collect();
         let grad = Self::lighting(rows, lit, &lamp).pull(&d_own).map_err(error::stage("medium.pull"))?;
         Ok(MediumRowsGrad { positions: grad.positions, normals: grad.normals, base_color })
     }
@@ -415,13 +416,15 @@ mod tests {
         let positions = vec![Vec3::new(0.1, 0.2, 0.97), Vec3::new(-0.6, 0.3, 0.74)];
         let normals: Vec<Vec3> = positions.iter().map(|p| (*p + Vec3::new(0.2, -0.1, 0.0)).normalize()).collect();
         let term = term(&positions, &normals);
+        let behind = -0.4 * normals[1] + 0.84f32.sqrt() * normals[1].any_orthonormal_vector();
         let rows = Rows {
             visible: vec![0, 1],
             positions: positions.clone(),
             rotations: vec![Quat::IDENTITY; 2],
             scales: vec![Vec3::ONE; 2],
             normals: normals.clone(),
-            view_directions: normals.clone(),
+            // The second is seen from behind, with a cosine of −0.4: of what it sends 0.6 counts, a weight that no gradient goes through.
+            view_directions: vec![normals[0], behind],
             codes: Vec::new(),
             transfer: Vec::new(),
         };
@@ -432,6 +435,7 @@ mod tests {
         let leaving = term.leaving(&[light]).unwrap();
         let tangent = [0.3, -0.5, 0.2, 0.4, 0.1, -0.7, 0.9, -0.2, 0.6];
         let cotangent = [0.8f32, -0.3, 0.5];
+        let front = [1.0, 0.6];
         for row in 0..2 {
             let around = term.attachment.rgb(row, &leaving[0]).to_array().map(f64::from);
             let (local, whole) = ([0.2, 0.3, 0.4].map(|v| v / std::f64::consts::PI), f64::from(whole()));
@@ -444,7 +448,9 @@ mod tests {
                 let length = (to[0] * to[0] + to[1] * to[1] + to[2] * to[2]).sqrt();
                 let cosine = (to[0] * x[3] + to[1] * x[4] + to[2] * x[5]) / length;
                 (0..3)
-                    .map(|c| of(2.0 / whole) * x[6 + c] * (of(around[c]) + of(local[c] * visibility) * cosine))
+                    .map(|c| {
+                        of(2.0 * front[row] / whole) * x[6 + c] * (of(around[c]) + of(local[c] * visibility) * cosine)
+                    })
                     .collect()
             };
             let duals: Vec<diamond_testkit::Dual> = x.iter().map(|v| diamond_testkit::Dual::of(*v)).collect();

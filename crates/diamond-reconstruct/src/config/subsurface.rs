@@ -90,7 +90,7 @@ impl Default for Subsurface {
             widths: 12,
             seeds: 6000,
             inset: 1.5,
-            seed_width: 0.45,
+            seed_width: 0.55,
             shape_rate: 0.3,
             normal_rate: 0.1,
             material_rate: 0.1,
