@@ -26,7 +26,7 @@ pub(crate) struct Update {
 }
 
 impl Update {
-    fn new(rate: f32, t: u64, rows: Rows) -> Self {
+    pub fn new(rate: f32, t: u64, rows: Rows) -> Self {
         // β₁ and β₂, as on the CPU.
         let correction = |beta: f32| 1.0 - libm::pow(f64::from(beta), t as f64);
         let (width, seen) = match rows {

@@ -53,7 +53,12 @@ impl Arrays {
         device.read(&parts)
     }
 
-    fn buffer(&self, column: Column) -> Result<&wgpu::Buffer, GpuError> {
+    /// Binding 0 of every kernel.
+    pub fn frame(&self) -> &wgpu::Buffer {
+        &self.frame
+    }
+
+    pub fn buffer(&self, column: Column) -> Result<&wgpu::Buffer, GpuError> {
         self.buffers.get(&column).ok_or_else(|| GpuError::Kernel {
             kernel: column.name().to_string(),
             problem: "the array was not made before it was used".into(),

@@ -137,8 +137,12 @@ pub struct GaussianGrad {
 mod tests {
     use super::*;
     use crate::adam::Update;
+    use crate::image_terms::ImageTerms;
     use crate::losses::Photometric;
+    use crate::model_view::{ModelView, Sample};
     use crate::network::Product;
+    use crate::parameter_arrays::Raw;
+    use crate::step_arrays::{Limits, Reduction};
     use crate::{Lighting, Module, Sources};
     use std::mem::{offset_of, size_of};
 
@@ -225,7 +229,20 @@ mod tests {
         }
         same_layout!(
             Module::Photometric,
-            Photometric { width, height, channels, border, space, step_ssim, step_l1, step_l2 }
+            Photometric {
+                width,
+                height,
+                channels,
+                border,
+                space,
+                step_ssim,
+                step_l1,
+                step_l2,
+                stride,
+                weighted,
+                unused_0,
+                unused_1,
+            }
         );
         same_layout!(Module::Adam, Update { step, scale, width, seen });
         same_layout!(
@@ -245,10 +262,81 @@ mod tests {
                 activation,
                 slope,
                 bias_first,
-                unused_0,
+                add,
                 unused_1,
             }
         );
+        for module in [Module::Activate, Module::ActivatePull] {
+            same_layout!(
+                module,
+                Raw {
+                    mean,
+                    scale,
+                    rotation,
+                    opacity,
+                    normal,
+                    base_color,
+                    roughness,
+                    metalness,
+                    subsurfaceness,
+                    channels,
+                    unused_0,
+                    unused_1,
+                }
+            );
+        }
+        for module in Module::ALL.into_iter().filter(|module| module.files().contains(&"model_view.wgsl")) {
+            same_layout!(
+                module,
+                ModelView {
+                    eye,
+                    directional,
+                    centre,
+                    inverse_half,
+                    light,
+                    light_reference,
+                    channels,
+                    codes,
+                    harmonics,
+                    network,
+                    first,
+                    rows,
+                    width,
+                    weight,
+                    local,
+                    whole,
+                    falloff_reference,
+                    tint,
+                    sample_distance,
+                    unused_0,
+                }
+            );
+        }
+        for module in [Module::SampledInputs, Module::SampledPull, Module::SampledScatter] {
+            same_layout!(module, Sample { viewer, gaussian, light, visibility });
+        }
+        same_layout!(
+            Module::ImageTerms,
+            ImageTerms {
+                masked,
+                pseudo,
+                mask,
+                normal,
+                smooth_base_color,
+                smooth_metalness,
+                smooth_roughness,
+                smooth_subsurfaceness,
+                enhancement,
+                incident,
+                stride,
+                unused_0,
+            }
+        );
+        same_layout!(Module::ClampScales, Limits { low, high, count, unused_0 });
+        same_layout!(Module::Reduce, Reduction { count, stride, out_stride, out_first });
+        for module in [Module::ActivatePull, Module::MediumPull] {
+            same_layout!(module, GaussianGrad { mean, form_a, form_b, screen });
+        }
         same_layout!(Module::ProjectionPull, GaussianGrad { mean, form_a, form_b, screen });
     }
 

@@ -40,6 +40,33 @@ impl Default for Sources {
             "product.wgsl",
             "photometric.wgsl",
             "mask_bce.wgsl",
+            "elementary.wgsl",
+            "raw.wgsl",
+            "model_view.wgsl",
+            "medium.wgsl",
+            "residual_row.wgsl",
+            "sample.wgsl",
+            "activate.wgsl",
+            "activate_pull.wgsl",
+            "residual_inputs.wgsl",
+            "residual_outputs.wgsl",
+            "residual_gather.wgsl",
+            "residual_scatter.wgsl",
+            "medium_rows.wgsl",
+            "medium_pull.wgsl",
+            "visibility_fit.wgsl",
+            "visibility_term.wgsl",
+            "transfer_smoothness.wgsl",
+            "sampled_inputs.wgsl",
+            "sampled_pull.wgsl",
+            "sampled_scatter.wgsl",
+            "radiance.wgsl",
+            "image_terms.wgsl",
+            "clamp_scales.wgsl",
+            "finite.wgsl",
+            "reduce.wgsl",
+            "pack_transport.wgsl",
+            "join_transport.wgsl",
         ];
         Self(files.into_iter().map(|(name, text)| (name, text.to_string())).collect())
     }
@@ -101,11 +128,53 @@ pub enum Module {
     Photometric,
     /// `mask_bce.wgsl`
     MaskBce,
+    /// `activate.wgsl`
+    Activate,
+    /// `activate_pull.wgsl`
+    ActivatePull,
+    /// `residual_inputs.wgsl`
+    ResidualInputs,
+    /// `residual_outputs.wgsl`
+    ResidualOutputs,
+    /// `residual_gather.wgsl`
+    ResidualGather,
+    /// `residual_scatter.wgsl`
+    ResidualScatter,
+    /// `medium_rows.wgsl`
+    MediumRows,
+    /// `medium_pull.wgsl`
+    MediumPull,
+    /// `visibility_fit.wgsl`
+    VisibilityFit,
+    /// `visibility_term.wgsl`
+    VisibilityTerm,
+    /// `transfer_smoothness.wgsl`
+    TransferSmoothness,
+    /// `sampled_inputs.wgsl`
+    SampledInputs,
+    /// `sampled_pull.wgsl`
+    SampledPull,
+    /// `sampled_scatter.wgsl`
+    SampledScatter,
+    /// `radiance.wgsl`
+    Radiance,
+    /// `image_terms.wgsl`
+    ImageTerms,
+    /// `clamp_scales.wgsl`
+    ClampScales,
+    /// `finite.wgsl`
+    Finite,
+    /// `reduce.wgsl`
+    Reduce,
+    /// `pack_transport.wgsl`
+    PackTransport,
+    /// `join_transport.wgsl`
+    JoinTransport,
 }
 
 impl Module {
     /// All of them.
-    pub const ALL: [Module; 17] = [
+    pub const ALL: [Module; 38] = [
         Module::Projection,
         Module::Scan,
         Module::Sort,
@@ -123,6 +192,27 @@ impl Module {
         Module::Product,
         Module::Photometric,
         Module::MaskBce,
+        Module::Activate,
+        Module::ActivatePull,
+        Module::ResidualInputs,
+        Module::ResidualOutputs,
+        Module::ResidualGather,
+        Module::ResidualScatter,
+        Module::MediumRows,
+        Module::MediumPull,
+        Module::VisibilityFit,
+        Module::VisibilityTerm,
+        Module::TransferSmoothness,
+        Module::SampledInputs,
+        Module::SampledPull,
+        Module::SampledScatter,
+        Module::Radiance,
+        Module::ImageTerms,
+        Module::ClampScales,
+        Module::Finite,
+        Module::Reduce,
+        Module::PackTransport,
+        Module::JoinTransport,
     ];
 
     /// The files that it is compiled from, in this order.
@@ -145,6 +235,36 @@ impl Module {
             Module::Product => &["frame.wgsl", "product.wgsl"],
             Module::Photometric => &["frame.wgsl", "photometric.wgsl"],
             Module::MaskBce => &["frame.wgsl", "mask_bce.wgsl"],
+            Module::Activate => &["frame.wgsl", "elementary.wgsl", "raw.wgsl", "activate.wgsl"],
+            Module::ActivatePull => &["frame.wgsl", "elementary.wgsl", "raw.wgsl", "activate_pull.wgsl"],
+            Module::ResidualInputs => {
+                &["frame.wgsl", "elementary.wgsl", "model_view.wgsl", "residual_row.wgsl", "residual_inputs.wgsl"]
+            }
+            Module::ResidualOutputs => &["frame.wgsl", "model_view.wgsl", "residual_outputs.wgsl"],
+            Module::ResidualGather => &["frame.wgsl", "model_view.wgsl", "residual_gather.wgsl"],
+            Module::ResidualScatter => &["frame.wgsl", "model_view.wgsl", "residual_scatter.wgsl"],
+            Module::MediumRows => &["frame.wgsl", "model_view.wgsl", "medium.wgsl", "medium_rows.wgsl"],
+            Module::MediumPull => &["frame.wgsl", "model_view.wgsl", "medium.wgsl", "medium_pull.wgsl"],
+            Module::VisibilityFit => &["frame.wgsl", "model_view.wgsl", "visibility_fit.wgsl"],
+            Module::VisibilityTerm => &["frame.wgsl", "model_view.wgsl", "visibility_term.wgsl"],
+            Module::TransferSmoothness => &["frame.wgsl", "model_view.wgsl", "transfer_smoothness.wgsl"],
+            Module::SampledInputs => &[
+                "frame.wgsl",
+                "elementary.wgsl",
+                "model_view.wgsl",
+                "residual_row.wgsl",
+                "sample.wgsl",
+                "sampled_inputs.wgsl",
+            ],
+            Module::SampledPull => &["frame.wgsl", "model_view.wgsl", "sample.wgsl", "sampled_pull.wgsl"],
+            Module::SampledScatter => &["frame.wgsl", "model_view.wgsl", "sample.wgsl", "sampled_scatter.wgsl"],
+            Module::Radiance => &["frame.wgsl", "radiance.wgsl"],
+            Module::ImageTerms => &["frame.wgsl", "elementary.wgsl", "image_terms.wgsl"],
+            Module::ClampScales => &["frame.wgsl", "clamp_scales.wgsl"],
+            Module::Finite => &["frame.wgsl", "finite.wgsl"],
+            Module::Reduce => &["frame.wgsl", "reduce.wgsl"],
+            Module::PackTransport => &["frame.wgsl", "pack_transport.wgsl"],
+            Module::JoinTransport => &["frame.wgsl", "join_transport.wgsl"],
         }
     }
 
@@ -168,6 +288,27 @@ impl Module {
             Module::Product => "rrrw",
             Module::Photometric => "rrwrwwww",
             Module::MaskBce => "rrww",
+            Module::Activate => "rrwwww",
+            Module::ActivatePull => "rrrrw",
+            Module::ResidualInputs => "rrrrrrrw",
+            Module::ResidualOutputs => "rrrrrrw",
+            Module::ResidualGather => "rrrwww",
+            Module::ResidualScatter => "rrww",
+            Module::MediumRows => "rrrrrw",
+            Module::MediumPull => "rrrrrrww",
+            Module::VisibilityFit => "rrrw",
+            Module::VisibilityTerm => "rrrrrww",
+            Module::TransferSmoothness => "rrww",
+            Module::SampledInputs => "rrrrrrrw",
+            Module::SampledPull => "rrrrwww",
+            Module::SampledScatter => "rrrw",
+            Module::Radiance => "rw",
+            Module::ImageTerms => "rrrrrww",
+            Module::ClampScales => "rw",
+            Module::Finite => "rw",
+            Module::Reduce => "rrw",
+            Module::PackTransport => "rrrw",
+            Module::JoinTransport => "rrw",
         }
     }
 }

@@ -19,6 +19,10 @@ pub(crate) struct Photometric {
     pub step_ssim: f32,
     pub step_l1: f32,
     pub step_l2: f32,
+    pub stride: u32,
+    pub weighted: u32,
+    pub unused_0: u32,
+    pub unused_1: u32,
 }
 
 /// The photometric loss of the rendered image and the photograph, both linear, as [`diamond_losses::photometric`] gives it
@@ -67,6 +71,10 @@ pub fn photometric(
         step_ssim: (-weight * lambda / windows) as f32,
         step_l1: (weight * (1.0 - lambda) * scale) as f32,
         step_l2: (2.0 * weight * lambda_l2 * scale) as f32,
+        stride: channels as u32,
+        weighted: 0,
+        unused_0: 0,
+        unused_1: 0,
     };
     let mut job = Job::new(device, &no_frame(0, [1, 1]))?;
     let settings = job.input("settings", bytemuck::cast_slice(bytemuck::bytes_of(&settings)))?;

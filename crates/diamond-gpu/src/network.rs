@@ -24,17 +24,17 @@ pub(crate) struct Product {
     pub activation: u32,
     pub slope: f32,
     pub bias_first: u32,
-    pub unused_0: u32,
+    pub add: u32,
     pub unused_1: u32,
 }
 
 /// Rows of a batch whose products with a cotangent are summed by one workgroup: a multiple of 16.
-const PART: u32 = 2048;
+pub(crate) const PART: u32 = 2048;
 /// Side of a tile of a product, as in `product.wgsl`.
-const TILE: u32 = 64;
+pub(crate) const TILE: u32 = 64;
 
 impl Product {
-    fn activated(self, activation: Activation) -> Self {
+    pub fn activated(self, activation: Activation) -> Self {
         let (activation, slope) = match activation {
             Activation::Linear => (0, 1.0),
             Activation::Relu => (1, 0.0),

@@ -128,7 +128,7 @@ pub const STAGES: &[StageRow] = &[
     },
 ];
 
-/// A part of the training step that runs on a device but is not yet chained to the stages there: each is called with arrays of the host.
+/// A part of the training step: what is compared, and how exact it has to be.
 #[derive(Debug)]
 pub struct ComponentRow {
     /// Its name, and that of its function in this crate.
@@ -143,7 +143,7 @@ pub struct ComponentRow {
     pub tolerance: f64,
 }
 
-/// Every such part.
+/// Parts that can also be called by themselves, with arrays of the host.
 pub const COMPONENTS: &[ComponentRow] = &[
     ComponentRow {
         name: "mlp_forward",
@@ -195,6 +195,116 @@ pub const COMPONENTS: &[ComponentRow] = &[
         backward: true,
         tolerance: 1e-6,
     },
+];
+
+/// Parts that exist within a step only, in the order in which they run.
+pub const STEP_PARTS: &[ComponentRow] = &[
+    ComponentRow {
+        name: "activate",
+        file: "activate",
+        twin: "diamond_reconstruct::GaussianParameters::activate",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "residual_inputs",
+        file: "residual_inputs",
+        twin: "diamond_shading::ResidualInputs::assemble",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "residual_outputs",
+        file: "residual_outputs",
+        twin: "diamond_shading::transfer_radiance",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "medium_rows",
+        file: "medium_rows",
+        twin: "diamond_reconstruct::MediumTerm",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "visibility_fit",
+        file: "visibility_fit",
+        twin: "diamond_shading::sh_visibility::visibilities",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "image_terms",
+        file: "image_terms",
+        twin: "diamond_losses::{mask_bce, normal_consistency, smoothness, enhancement, incident_light}",
+        backward: true,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "medium_pull",
+        file: "medium_pull",
+        twin: "diamond_reconstruct::MediumTerm",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "residual_gather",
+        file: "residual_gather",
+        twin: "diamond_shading::TransferPullback::pull",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "residual_scatter",
+        file: "residual_scatter",
+        twin: "diamond_shading::ResidualInputsPullback::pull",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "activate_pull",
+        file: "activate_pull",
+        twin: "diamond_reconstruct::GaussianParameters::pull",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "visibility_term",
+        file: "visibility_term",
+        twin: "diamond_losses::visibility",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "transfer_smoothness",
+        file: "transfer_smoothness",
+        twin: "diamond_reconstruct: transfer_smoothness",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "sampled_inputs",
+        file: "sampled_inputs",
+        twin: "diamond_shading::ResidualInputs::assemble",
+        backward: false,
+        tolerance: 1e-5,
+    },
+    ComponentRow {
+        name: "sampled_pull",
+        file: "sampled_pull",
+        twin: "diamond_reconstruct: pull_to_nothing",
+        backward: true,
+        tolerance: 1e-4,
+    },
+    ComponentRow {
+        name: "clamp_scales",
+        file: "clamp_scales",
+        twin: "diamond_reconstruct::GaussianParameters::clamp_covariances",
+        backward: true,
+        tolerance: 1e-6,
+    },
+    ComponentRow { name: "reduce", file: "reduce", twin: "sums in f64", backward: false, tolerance: 1e-5 },
 ];
 
 /// Something that the device does.
@@ -442,8 +552,10 @@ mod tests {
         let names: Vec<&str> = STAGES.iter().map(|row| row.name).collect();
         for module in Module::ALL {
             let file = module.files().last().unwrap().trim_end_matches(".wgsl");
-            let component = COMPONENTS.iter().any(|row| row.file == file);
-            assert!(names.contains(&file) || component || ["scan", "sort"].contains(&file), "{file}");
+            let component = COMPONENTS.iter().chain(STEP_PARTS).any(|row| row.file == file);
+            // These are parts of others, or compared with the whole step.
+            let others = ["scan", "sort", "radiance", "finite", "sampled_scatter", "pack_transport", "join_transport"];
+            assert!(names.contains(&file) || component || others.contains(&file), "{file}");
         }
     }
 

@@ -16,6 +16,11 @@ struct Photometric {
     step_ssim: f32,
     step_l1: f32,
     step_l2: f32,
+    // Numbers per pixel of the photograph; 1: the last is how much the pixel counts [eq:believed].
+    stride: u32,
+    weighted: u32,
+    unused_0: u32,
+    unused_1: u32,
 }
 
 @group(0) @binding(1) var<storage, read> settings: Photometric;
@@ -90,6 +95,11 @@ fn slope_of(x: f32, stored: f32) -> f32 {
     return 1.0;
 }
 
+// How much a pixel counts.
+fn weight_of(pixel: u32) -> f32 {
+    return select(1.0, photograph[pixel * settings.stride + settings.stride - 1u], settings.weighted != 0u);
+}
+
 // The number of the value at this place of the tile with its surroundings; the last bit says whether it is outside.
 fn place(tile: vec2<u32>, n: u32) -> vec2<u32> {
     let x = tile.x * 16u + n % SIDE;
@@ -112,7 +122,7 @@ fn compare_windows(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invoca
             let at = place(tile.xy, n);
             let i = at.x * settings.channels + c;
             tile_a[n] = select(rendered[i], 0.0, at.y != 0u);
-            tile_b[n] = select(photograph[i], 0.0, at.y != 0u);
+            tile_b[n] = select(photograph[at.x * settings.stride + c], 0.0, at.y != 0u);
         }
         workgroupBarrier();
         let corner = lane / 16u * SIDE + lane % 16u;
@@ -157,9 +167,10 @@ fn compare_windows(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invoca
             let dissimilarity = apart * apart / b_1 + (a_1 / b_1) * (spread / b_2);
             let by_mean = 2.0 * mean_b / b_1 * (a_2 / b_2) - similarity * 2.0 * mean_a / b_1;
             let derivatives = vec3<f32>(by_mean, -similarity / b_2, 2.0 * (a_1 / b_1) / b_2);
-            fields[i] = vec4<f32>(select(vec3<f32>(0.0), derivatives, counted), mean_a);
+            let weight = weight_of(y * settings.width + x);
+            fields[i] = vec4<f32>(select(vec3<f32>(0.0), weight * derivatives, counted), mean_a);
             means[i] = mean_b;
-            sums[i] = vec4<f32>(select(0.0, dissimilarity, counted), abs(a - b), (a - b) * (a - b), 0.0);
+            sums[i] = weight * vec4<f32>(select(0.0, dissimilarity, counted), abs(a - b), (a - b) * (a - b), 0.0);
         }
     }
 }
@@ -179,9 +190,10 @@ fn gather_gradient(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invoca
         }
         workgroupBarrier();
         let corner = lane / 16u * SIDE + lane % 16u;
-        let i = (min(y, settings.height - 1u) * settings.width + min(x, settings.width - 1u)) * settings.channels + c;
+        let pixel = min(y, settings.height - 1u) * settings.width + min(x, settings.width - 1u);
+        let i = pixel * settings.channels + c;
         let a = rendered[i];
-        let b = photograph[i];
+        let b = photograph[pixel * settings.stride + c];
         var sum = 0.0;
         var taps = TAPS;
         for (var dy = 0u; dy < 11u; dy++) {
@@ -194,7 +206,8 @@ fn gather_gradient(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invoca
             }
         }
         if inside {
-            let d = settings.step_ssim * sum + settings.step_l1 * sign(a - b) + settings.step_l2 * (a - b);
+            let direct = settings.step_l1 * sign(a - b) + settings.step_l2 * (a - b);
+            let d = settings.step_ssim * sum + weight_of(pixel) * direct;
             gradient[i] = d * slope_of(linear[i], a);
         }
     }

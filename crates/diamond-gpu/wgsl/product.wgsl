@@ -23,7 +23,8 @@ struct Product {
     slope: f32,
     // First number of the bias.
     bias_first: u32,
-    unused_0: u32,
+    // 1: sums are added to what is there.
+    add: u32,
     unused_1: u32,
 }
 
@@ -105,7 +106,23 @@ fn sum_parts(
     for (var part = 0u; part < (product.k + product.part - 1u) / product.part; part++) {
         sum += a[part * size + i];
     }
+    if product.add != 0u {
+        sum += c[product.c_first + i];
+    }
     c[product.c_first + i] = sum;
+}
+
+// c += a.
+@compute @workgroup_size(256)
+fn add_to(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) grid: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_workgroup(id, grid) * 256u + lane;
+    if i < product.m * product.n {
+        c[i] += a[i];
+    }
 }
 
 // c += bias, then the activation; b holds the parameters.

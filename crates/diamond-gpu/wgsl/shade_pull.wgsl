@@ -4,8 +4,8 @@
 @group(0) @binding(1) var<storage, read> lighting: Lighting;
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> coverage: array<vec4<f32>>;
-// 18 numbers per pixel, two of padding: radiance, base colour, roughness, metalness, subsurfaceness, normal, residual,
-// incident, visibility, depth.
+// 20 numbers per pixel: radiance, base colour, roughness, metalness, subsurfaceness, normal, residual, incident, visibility, depth, what
+// the objective says of the opacity itself, and one of padding.
 @group(0) @binding(4) var<storage, read> d_record: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> d_picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> d_coverage: array<vec2<f32>>;
@@ -32,7 +32,7 @@ fn shade_pull(
         for (var k = 0u; k < 4u; k++) {
             d_picture[4u * i + k] = vec4<f32>(0.0);
         }
-        d_coverage[i] = vec2<f32>(0.0);
+        d_coverage[i] = vec2<f32>(d_record[5u * i + 4u].z, 0.0);
         return;
     }
     let e0 = d_record[5u * i];
@@ -110,5 +110,5 @@ fn shade_pull(
     d_picture[4u * i + 1u] = d1 * p.weight;
     d_picture[4u * i + 2u] = d2 * p.weight;
     d_picture[4u * i + 3u] = d3 * p.weight;
-    d_coverage[i] = vec2<f32>(dot(d_shown, lit) - d_inverse / p.opacity, d_depth / p.opacity);
+    d_coverage[i] = vec2<f32>(dot(d_shown, lit) - d_inverse / p.opacity + e4.z, d_depth / p.opacity);
 }

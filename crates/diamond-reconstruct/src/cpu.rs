@@ -4,10 +4,11 @@
 use crate::agreement::Comparison;
 use crate::objective::{self, Terms};
 use crate::random::{Purpose, Random};
+use crate::resident::Resident;
 use crate::visibility_cache::VisibilityCache;
 use crate::{
     Activated, ActivatedGrad, Attribute, Blender, CaptureFacts, Counters, DensityStrategy, Engine, ExposureMode,
-    GaussianParameters, Layout, MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport,
+    GaussianParameters, Layout, MediumTerm, Model, Needs, ReconstructError, Rendering, StepPlan, StepReport, Stepper,
     TensorFile, TrainingPair, adam, error,
 };
 use crate::{forward, mcmc, residual_pull};
@@ -21,19 +22,21 @@ use std::time::Instant;
 /// The training step and renderer on the CPU.
 pub struct CpuEngine {
     pub(crate) model: Model,
-    needs: Needs,
+    pub(crate) needs: Needs,
     pub(crate) visibility: VisibilityCache,
     pub(crate) stats: DensityStats,
-    profile: Profile,
-    counters: Counters,
+    pub(crate) profile: Profile,
+    pub(crate) counters: Counters,
     /// Training views.
-    views: usize,
+    pub(crate) views: usize,
     /// Who blends training pictures, if not the CPU.
     blender: Option<Box<dyn Blender>>,
+    /// Who makes whole steps, if not the CPU.
+    pub(crate) resident: Option<Resident>,
 }
 
 /// Steps after which Gaussians look anew for the surfels around them.
-const ATTACH_STEPS: u64 = 100;
+pub(crate) const ATTACH_STEPS: u64 = 100;
 
 /// Seconds per part of a step.
 #[derive(Debug, Clone, Default)]
@@ -88,6 +91,7 @@ impl CpuEngine {
             counters: Counters::default(),
             views: 1,
             blender: None,
+            resident: None,
         }
     }
 
@@ -109,6 +113,34 @@ impl CpuEngine {
         }
     }
 
+    /// Learning rate of each attribute at a step, in the order of [`Attribute::ALL`]; 0 for those that have no gradient.
+    pub(crate) fn rates(&self, plan: &StepPlan) -> [f32; 13] {
+        let (rates, factor) = (&self.model.config.rates, plan.attribute_factor);
+        Attribute::ALL.map(|attribute| match attribute {
+            attribute if !self.learns(attribute, plan) => 0.0,
+            Attribute::Mean => plan.mean_rate * self.model.scene.extent,
+            Attribute::Scale => rates.scale * factor,
+            Attribute::Rotation => rates.rotation * factor,
+            Attribute::Shear => rates.shear * factor,
+            Attribute::Opacity => rates.opacity * factor,
+            Attribute::Normal => rates.normal * plan.normal_factor,
+            Attribute::BaseColor | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => {
+                rates.material * plan.material_factor
+            }
+            Attribute::VisibilitySh => rates.visibility_sh * plan.material_factor,
+            Attribute::Transfer => rates.transfer * plan.material_factor,
+            Attribute::Codes => rates.codes * plan.material_factor,
+        })
+    }
+
+    /// Finds the surfels around the Gaussians anew, where there is a medium.
+    pub(crate) fn attach(&mut self) {
+        let model = &mut self.model;
+        if let Some(medium) = &mut model.medium {
+            medium.attach(&model.parameters.activate());
+        }
+    }
+
     fn apply(
         &mut self,
         step: u64,
@@ -119,30 +151,15 @@ impl CpuEngine {
     ) -> Result<(), ReconstructError> {
         let gradients = self.model.parameters.pull(activated, grad);
         check_gradients(&self.model.parameters, &gradients, step)?;
-        let rates = self.model.config.rates.clone();
         let extent = self.model.scene.extent;
-        let factor = plan.attribute_factor;
         let learns = Attribute::ALL.map(|attribute| self.learns(attribute, plan));
         for (group, _) in self.model.parameters.groups().iter().zip(learns).filter(|(_, learns)| !learns) {
             self.counters.add("Adam values left out", group.values.len());
         }
+        let rates = self.rates(plan);
         self.model.parameters.adam_step(
             &gradients,
-            |attribute| match attribute {
-                attribute if !learns[attribute as usize] => 0.0,
-                Attribute::Mean => plan.mean_rate * extent,
-                Attribute::Scale => rates.scale * factor,
-                Attribute::Rotation => rates.rotation * factor,
-                Attribute::Shear => rates.shear * factor,
-                Attribute::Opacity => rates.opacity * factor,
-                Attribute::Normal => rates.normal * plan.normal_factor,
-                Attribute::BaseColor | Attribute::Roughness | Attribute::Metalness | Attribute::Subsurfaceness => {
-                    rates.material * plan.material_factor
-                }
-                Attribute::VisibilitySh => rates.visibility_sh * plan.material_factor,
-                Attribute::Transfer => rates.transfer * plan.material_factor,
-                Attribute::Codes => rates.codes * plan.material_factor,
-            },
+            |attribute| rates[attribute as usize],
             step + 1,
             self.model.config.adam.sparse,
         );
@@ -192,6 +209,15 @@ impl Engine for CpuEngine {
         plan: &StepPlan,
         batch: &[TrainingPair<'_>],
     ) -> Result<StepReport, ReconstructError> {
+        if self.resident.is_some() {
+            let Some(lacking) = self.beyond_stepper(plan, batch) else {
+                return self.step_there(step, plan, batch);
+            };
+            self.counters.add("steps on the CPU", 1);
+            self.recall()?;
+            self.changed_here();
+            self.tell(step, lacking);
+        }
         let start = Instant::now();
         let n = self.model.len();
         let activated = self.model.parameters.activate();
@@ -326,10 +352,7 @@ impl Engine for CpuEngine {
         let density = self.control_density(step, plan)?;
         let last = step + 1 == self.model.config.steps;
         if plan.densify || last || (step + 1).is_multiple_of(ATTACH_STEPS) {
-            let model = &mut self.model;
-            if let Some(medium) = &mut model.medium {
-                medium.attach(&model.parameters.activate());
-            }
+            self.attach();
         }
         self.profile.add("density control", t);
         Ok(StepReport {
@@ -344,6 +367,7 @@ impl Engine for CpuEngine {
     }
 
     fn render(&mut self, camera: &Camera, lights: &[OlatLight]) -> Result<Vec<Rendering>, ReconstructError> {
+        self.recall()?;
         self.model.render(camera, lights)
     }
 
@@ -351,7 +375,18 @@ impl Engine for CpuEngine {
         self.blender = Some(blender);
     }
 
+    fn step_by(&mut self, stepper: Box<dyn Stepper>, plan: &StepPlan) -> Option<String> {
+        self.resident = Some(Resident { stepper, here: true, there: false, lacking: Vec::new(), notes: Vec::new() });
+        self.beyond_stepper(plan, &[])
+    }
+
+    fn take_notes(&mut self) -> Vec<String> {
+        self.resident.as_mut().map_or_else(Vec::new, |resident| std::mem::take(&mut resident.notes))
+    }
+
     fn adopt_medium(&mut self, medium: MediumTerm) -> Result<(), ReconstructError> {
+        self.recall()?;
+        self.changed_here();
         let seeds = self.model.config.subsurface.seeds;
         if let Some(sources) = self.model.adopt_medium(medium, seeds)? {
             self.visibility.gather(&sources);
@@ -361,10 +396,12 @@ impl Engine for CpuEngine {
     }
 
     fn model(&mut self) -> Result<&Model, ReconstructError> {
+        self.recall()?;
         Ok(&self.model)
     }
 
     fn state(&mut self) -> Result<TensorFile, ReconstructError> {
+        self.recall()?;
         let mut file = TensorFile::default();
         let n = self.model.len();
         for group in self.model.parameters.groups() {
@@ -431,6 +468,7 @@ impl Engine for CpuEngine {
         self.model.medium = MediumTerm::restore(path, &mut state, n, self.model.config.subsurface.surfels, falloff)?;
         self.model.parameters = parameters;
         self.model.match_residual_output();
+        self.changed_here();
         Ok(())
     }
 

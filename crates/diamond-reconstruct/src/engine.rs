@@ -1,7 +1,7 @@
 //! What runs a training step and renders: the CPU now, a GPU later, behind one trait.
 use crate::objective::TermValue;
 use crate::region::Region;
-use crate::{Blender, Guide, MediumTerm, Model, ReconstructError, StepPlan, TensorFile};
+use crate::{Blender, Guide, MediumTerm, Model, ReconstructError, StepPlan, Stepper, TensorFile};
 use diamond_camera::Camera;
 use diamond_image::{Image, Mask};
 use diamond_light::OlatLight;
@@ -96,6 +96,13 @@ pub trait Engine {
 
     /// From now on training pictures are blended by `blender`.
     fn blend_by(&mut self, blender: Box<dyn Blender>);
+
+    /// From now on `stepper` makes the training steps that it can make; the others are made as before. What of a step without images it cannot do, in words
+    /// of the configuration; `None`: nothing that is known beforehand.
+    fn step_by(&mut self, stepper: Box<dyn Stepper>, plan: &StepPlan) -> Option<String>;
+
+    /// What has happened since this was last asked that a user wants to know: which steps a stepper cannot make.
+    fn take_notes(&mut self) -> Vec<String>;
 
     /// Takes a medium into the model, the first one or another.
     fn adopt_medium(&mut self, medium: MediumTerm) -> Result<(), ReconstructError>;

@@ -9,9 +9,9 @@
 //! to what leaves the medium rather than mixed with it.
 use crate::rows::{LightRows, Rows};
 use crate::visibility_cache::{LightKey, key};
-use crate::{Activated, Attribute, Model, ReconstructError, TensorFile, error, logit, stored_medium};
+use crate::{Activated, Attribute, Model, ReconstructError, StepMedium, TensorFile, error, logit, stored_medium};
 use diamond_light::{Falloff, OlatLight};
-use diamond_medium::{Attachment, Exitance, Medium, Near, Surface};
+use diamond_medium::{Attachment, Exitance, Medium, Near, Surface, Transport};
 use diamond_shading::{Entry, SurfelLighting};
 use glam::{Quat, Vec3};
 use std::collections::BTreeMap;
@@ -97,6 +97,17 @@ impl MediumTerm {
     /// How far light goes; see [`Exitance::spread`].
     pub fn spread(&self) -> Vec<(f32, Vec3)> {
         self.exitance.spread(&self.surface)
+    }
+
+    /// Which surfels each Gaussian takes its value from.
+    pub fn attachment(&self) -> &Attachment {
+        &self.attachment
+    }
+
+    /// What does not depend on the light; `None` for random walks, whose exits depend on the viewer.
+    pub(crate) fn constants(&self) -> Option<StepMedium> {
+        let walks = matches!(self.medium.transport, Transport::Walk { .. });
+        (!walks).then(|| StepMedium { local: self.local(), whole: whole(), falloff: self.falloff, tint: TINT })
     }
 
     /// The medium.
@@ -393,7 +404,7 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diamond_medium::{Coat, Transport};
+    use diamond_medium::Coat;
     use diamond_pathtrace::Mesh;
     use diamond_testkit::adjoint::adjoint_gap;
     use diamond_testkit::{Real, jvp};

@@ -239,6 +239,15 @@ pub fn evaluate(
     Ok(Outcome { grad: out, terms, psnr: decibel(fraction * error), psnr_encoded: known.is_none(), log_gain })
 }
 
+/// Gaussians on which the SH visibility is compared, as often as they are drawn.
+pub fn visibility_samples(model: &Model, random: &mut Random) -> Vec<usize> {
+    let n = model.len();
+    match model.config.visibility.samples {
+        samples if samples >= n => (0..n).collect(),
+        samples => (0..samples).map(|_| random.below(n)).collect(),
+    }
+}
+
 /// The SH visibility term on random Gaussians toward one light: adds to `d_sh` and returns the value.
 pub fn visibility_term(
     model: &Model,
@@ -249,10 +258,7 @@ pub fn visibility_term(
     d_sh: &mut Vec<f32>,
 ) -> Result<TermValue, ReconstructError> {
     let n = model.len();
-    let rows: Vec<usize> = match model.config.visibility.samples {
-        samples if samples >= n => (0..n).collect(),
-        samples => (0..samples).map(|_| random.below(n)).collect(),
-    };
+    let rows = visibility_samples(model, random);
     let means = model.parameters.values(Attribute::Mean);
     let all = model.parameters.values(Attribute::VisibilitySh);
     let directions: Vec<Vec3> = rows

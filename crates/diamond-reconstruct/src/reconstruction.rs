@@ -10,7 +10,7 @@ use crate::tensor_file::TensorFile;
 use crate::turns::{Turn, Turns};
 use crate::{
     Blender, CaptureFacts, Config, CpuEngine, Engine, Exposure, FirstExposure, Guide, Model, Needs, Neighbour,
-    ReconstructError, Rendering, Scene, StepPlan, StepReport, TrainingPair,
+    ReconstructError, Rendering, Scene, StepPlan, StepReport, Stepper, TrainingPair,
 };
 use diamond_augment::{Frame, Source};
 use diamond_camera::Camera;
@@ -138,6 +138,12 @@ impl Reconstruction {
     /// From now on training pictures are blended by `blender`.
     pub fn blend_by(&mut self, blender: Box<dyn Blender>) {
         self.engine.blend_by(blender);
+    }
+
+    /// From now on `stepper` makes the training steps that it can make; the others are made as before. What of the next step it cannot do, as far as that is
+    /// known without its images, in words of the configuration.
+    pub fn step_by(&mut self, stepper: Box<dyn Stepper>) -> Option<String> {
+        self.engine.step_by(stepper, &StepPlan::new(&self.config, self.step))
     }
 
     /// Continues from the checkpoint in `folder`, bit for bit as if the run had not been interrupted. The configuration
@@ -391,6 +397,7 @@ impl Reconstruction {
             })
             .collect();
         let report = engine.training_step(step, &plan, &pairs)?;
+        self.notes.extend(self.engine.take_notes());
         self.step += 1;
         Ok(report)
     }

@@ -13,7 +13,7 @@ use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
 use crate::visibility_cache::{LightKey, Tracer, key};
-use crate::{Activated, CaptureFacts, MediumTerm, Model, Needs, ReconstructError, Rendering, error};
+use crate::{Activated, CaptureFacts, MediumTerm, Model, Needs, ReconstructError, Relighter, Rendering, error};
 use diamond_camera::Camera;
 use diamond_image::Image;
 use diamond_light::OlatLight;
@@ -36,29 +36,31 @@ pub const PICTURE_BYTES: usize = 256 << 20;
 
 /// A model ready to be rendered from any number of views.
 pub struct Renderer<'m> {
-    model: &'m Model,
-    activated: Activated,
-    needs: RenderNeeds,
+    pub(crate) model: &'m Model,
+    pub(crate) activated: Activated,
+    pub(crate) needs: RenderNeeds,
     /// Built when the first light needs it.
     tracer: OnceLock<Tracer>,
     lights_together: usize,
     picture_bytes: usize,
     /// Bytes of what is kept of lights from one view to the next.
-    kept_bytes: usize,
+    pub(crate) kept_bytes: usize,
+    /// Who makes radiance, if not the CPU.
+    pub(crate) relighter: Option<Mutex<Box<dyn Relighter>>>,
     kept: Mutex<BTreeMap<LightKey, Arc<LightHalf>>>,
 }
 
 /// What a light is to Gaussians, whatever the view.
-struct LightHalf {
+pub(crate) struct LightHalf {
     /// Empty where nothing reads it.
-    visibility: Vec<f32>,
+    pub visibility: Vec<f32>,
     /// [`MediumTerm::sent`]; empty without a medium.
-    medium: Vec<Vec3>,
+    pub medium: Vec<Vec3>,
 }
 
 impl LightHalf {
     /// Of `gaussians` Gaussians.
-    fn bytes(gaussians: usize, visibility: bool, medium: bool) -> usize {
+    pub fn bytes(gaussians: usize, visibility: bool, medium: bool) -> usize {
         gaussians * (usize::from(visibility) * size_of::<f32>() + usize::from(medium) * size_of::<Vec3>())
     }
 
@@ -119,6 +121,7 @@ impl<'m> Renderer<'m> {
             lights_together: LIGHTS_TOGETHER,
             picture_bytes: PICTURE_BYTES,
             kept_bytes: 0,
+            relighter: None,
             kept: Mutex::default(),
         }
     }
@@ -143,7 +146,7 @@ impl<'m> Renderer<'m> {
     }
 
     /// Lights that go together where a picture has so many pixels.
-    fn group_of(&self, (width, height): (usize, usize)) -> usize {
+    pub(crate) fn group_of(&self, (width, height): (usize, usize)) -> usize {
         let bytes = (width * height).saturating_mul(3 * size_of::<f32>()).max(1);
         (self.picture_bytes / bytes).clamp(1, self.lights_together)
     }
@@ -159,6 +162,14 @@ impl<'m> Renderer<'m> {
             return Ok(Vec::new());
         }
         let mut out = Vec::with_capacity(lights.len());
+        if let Some(relighter) = &self.relighter {
+            let mut see = |_, image| -> Result<(), ReconstructError> {
+                out.push(image);
+                Ok(())
+            };
+            self.relit(relighter, camera, lights, &mut see)?;
+            return Ok(out);
+        }
         let view = self.view(camera, &self.needs.layout())?;
         let mut buffers = Buffers::default();
         for group in lights.chunks(self.group_of(view.size)) {
@@ -181,6 +192,9 @@ impl<'m> Renderer<'m> {
     ) -> Result<(), E> {
         if lights.is_empty() {
             return Ok(());
+        }
+        if let Some(relighter) = &self.relighter {
+            return self.relit(relighter, camera, lights, &mut |k, image| see(k, &image));
         }
         let view = self.view(camera, &self.needs.layout())?;
         let (mut buffers, together) = (Buffers::default(), self.group_of(view.size));
@@ -266,7 +280,7 @@ impl<'m> Renderer<'m> {
         })
     }
 
-    fn tracer(&self) -> Result<&Tracer, ReconstructError> {
+    pub(crate) fn tracer(&self) -> Result<&Tracer, ReconstructError> {
         if let Some(tracer) = self.tracer.get() {
             return Ok(tracer);
         }
@@ -452,7 +466,7 @@ impl<'m> Renderer<'m> {
             .collect()
     }
 
-    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Arc<LightHalf>>> {
+    pub(crate) fn kept(&self) -> std::sync::MutexGuard<'_, BTreeMap<LightKey, Arc<LightHalf>>> {
         // Whoever panicked with the lock held left whole entries behind.
         self.kept.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }

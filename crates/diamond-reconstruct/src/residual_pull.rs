@@ -6,12 +6,29 @@
 use crate::objective::TermValue;
 use crate::random::Random;
 use crate::rows::{LightRows, Rows, input_scaling, residual_inputs, transfer_config};
-use crate::{Activated, ActivatedGrad, Attribute, Model, ReconstructError, error};
+use crate::{Activated, ActivatedGrad, Attribute, Model, PullSample, ReconstructError, StepPull, error};
 use diamond_shading::{InputGradients, transfer_radiance};
 use glam::Vec3;
 
 /// Gaussians that are looked at in a step.
 const SAMPLES: usize = 1024;
+
+/// Draws who is asked: in order and each once, as rows are.
+pub(crate) fn draw(model: &Model, views: usize, random: &mut Random) -> StepPull {
+    let n = model.len();
+    let mut visible: Vec<u32> = (0..SAMPLES.min(n)).map(|_| random.below(n) as u32).collect();
+    visible.sort_unstable();
+    visible.dedup();
+    let views_drawn: Vec<Vec3> = visible.iter().map(|_| random.direction()).collect();
+    let lights: Vec<Vec3> = visible.iter().map(|_| random.direction()).collect();
+    let drawn = visible.into_iter().zip(views_drawn).zip(lights);
+    let one = |((gaussian, view), light)| PullSample { gaussian, view, light, visibility: random.uniform() };
+    StepPull {
+        weight: model.config.subsurface.residual_weight / views.max(1) as f32,
+        samples: drawn.map(one).collect(),
+        distance: model.scene.light_distance,
+    }
+}
 
 /// Value of the term; adds its gradient, times its weight, to codes, transfer vectors and network.
 pub(crate) fn pull_to_nothing(
@@ -22,25 +39,18 @@ pub(crate) fn pull_to_nothing(
     total: &mut ActivatedGrad,
     network_grad: &mut Vec<Vec<f32>>,
 ) -> Result<TermValue, ReconstructError> {
-    let (n, weight) = (model.len(), model.config.subsurface.residual_weight / views.max(1) as f32);
-    let samples = SAMPLES.min(n);
-    // In order and each once, as rows are.
-    let mut visible: Vec<u32> = (0..samples).map(|_| random.below(n) as u32).collect();
-    visible.sort_unstable();
-    visible.dedup();
-    let mut outward = |normal: Vec3| {
-        let d = random.direction();
-        if d.dot(normal) < 0.0 { -d } else { d }
-    };
-    let view_directions: Vec<Vec3> = visible.iter().map(|&i| outward(activated.normals[i as usize])).collect();
-    let rows = Rows::with_view_directions(model, activated, view_directions, &visible);
-    let directions: Vec<Vec3> = (0..rows.len()).map(|_| random.direction()).collect();
-    let visibility: Vec<f32> = directions
-        .iter()
-        .zip(&rows.normals)
-        .map(|(l, normal)| if l.dot(*normal) > 0.0 { random.uniform() } else { 0.0 })
-        .collect();
-    let lit = LightRows { visibility, directions, distances: vec![model.scene.light_distance; rows.len()] };
+    let n = model.len();
+    let StepPull { weight, samples, distance } = draw(model, views, random);
+    let visible: Vec<u32> = samples.iter().map(|s| s.gaussian).collect();
+    let normal = |s: &PullSample| activated.normals[s.gaussian as usize];
+    let outward = samples.iter().map(|s| if s.view.dot(normal(s)) < 0.0 { -s.view } else { s.view });
+    let rows = Rows::with_view_directions(model, activated, outward.collect(), &visible);
+    let directions: Vec<Vec3> = samples.iter().map(|s| s.light).collect();
+    // Those whose light is in front of the normal take the numbers that were drawn, one after the other.
+    let mut drawn = samples.iter().map(|s| s.visibility);
+    let seen = |s: &PullSample| if s.light.dot(normal(s)) > 0.0 { drawn.next().unwrap_or(0.0) } else { 0.0 };
+    let visibility = samples.iter().map(seen).collect();
+    let lit = LightRows { visibility, directions, distances: vec![distance; rows.len()] };
     let mut sum = vec![0.0f32; 3 * rows.len()];
     let inputs = residual_inputs(model, &rows, &lit);
     let scaling = input_scaling(model);

@@ -209,6 +209,16 @@ impl VisibilityCache {
         Ok(self.entries.get(&key).map_or(&[], |e| &e.values))
     }
 
+    /// Visibility of `gaussians` Gaussians toward `light`, if it was traced less than so many steps ago.
+    pub fn young(&mut self, every_steps: u64, gaussians: usize, light: &OlatLight, step: u64) -> Option<&[f32]> {
+        let entry = self.entries.get(&key(light)).filter(|e| e.values.len() == gaussians)?;
+        if step.saturating_sub(entry.step) >= every_steps {
+            return None;
+        }
+        self.lookups += 1;
+        Some(&entry.values)
+    }
+
     /// Follows a change of the set of Gaussians.
     pub fn gather(&mut self, sources: &[(u32, bool)]) {
         for entry in self.entries.values_mut() {

@@ -11,7 +11,7 @@ fn table(adapters: &[Adapter], threads: usize) -> String {
     let mut text = format!("cpu     {threads} threads: reconstructs and renders\n");
     for a in adapters {
         let use_of =
-            if a.kind == DeviceKind::Software { "for tests only, slower than cpu" } else { "blends training pictures" };
+            if a.kind == DeviceKind::Software { "for tests only, slower than cpu" } else { "trains and renders" };
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
@@ -29,7 +29,7 @@ fn table(adapters: &[Adapter], threads: usize) -> String {
     if adapters.is_empty() {
         text += "no GPU: no driver for Vulkan, Metal or Direct3D 12 was found\n";
     }
-    text += "diamond reconstruct --device gpu:N blends training pictures there, forward and backward; all else runs on the CPU so far\n";
+    text += "diamond reconstruct --device gpu:N makes training steps there, diamond render pictures; rays and density control run on the CPU\n";
     text
 }
 

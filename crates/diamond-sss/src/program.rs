@@ -170,6 +170,7 @@ fn render_options(a: RenderArguments) -> Result<RenderOptions, SssError> {
         size: a.size,
         medium: a.medium,
         linear: a.linear,
+        device: Some(a.device),
         exposure: a.exposure,
     })
 }

@@ -10,7 +10,7 @@ use crate::{
 };
 use diamond_augment::Lack;
 use diamond_dataset::{Capture, Selection, SelectionManifest};
-use diamond_gpu::{Device, DeviceChoice, Rasterizer};
+use diamond_gpu::{Device, DeviceChoice, DeviceStepper, Rasterizer};
 use diamond_reconstruct::{
     ByteSize, CaptureFacts, Config, InitialSource, InstructionChoice, Needs, ReconstructError, Reconstruction,
     StepReport,
@@ -49,7 +49,7 @@ pub struct ReconstructOptions {
     pub selection: Option<PathBuf>,
     /// Points (PLY) or splats (any format) to start from, in place of the capture's.
     pub initial: Option<PathBuf>,
-    /// Where training pictures are blended; everything else runs on the CPU.
+    /// Where training steps are made.
     pub device: DeviceChoice,
     /// Continue from the checkpoint.
     pub resume: bool,
@@ -304,8 +304,15 @@ fn run(
     };
     training.keep_pictures_in(&folder.join(MADE_PICTURES));
     if let Some(device) = device {
-        events(Event::Note(format!("training pictures are blended on {}", device.adapter().name)));
-        training.blend_by(Box::new(Rasterizer::new(device).map_err(device_error)?));
+        let name = device.adapter().name.clone();
+        training.blend_by(Box::new(Rasterizer::new(device.clone()).map_err(device_error)?));
+        let stepper = DeviceStepper::new(device).map_err(device_error)?;
+        events(Event::Note(match training.step_by(Box::new(stepper)) {
+            None => format!("training steps are made on {name}"),
+            Some(lacking) => {
+                format!("training steps are made on the CPU, their pictures on {name}, which lacks {lacking}")
+            }
+        }));
     }
     peak_after.note("first Gaussians");
     let mut log = match resumed {
@@ -475,6 +482,6 @@ fn write_profile(folder: &Path, steps: u64, costs: &Costs, peak_after: &PeakAfte
     write_json(&folder.join("profile.json"), &value)
 }
 
-fn device_error(error: diamond_gpu::GpuError) -> SssError {
+pub(crate) fn device_error(error: diamond_gpu::GpuError) -> SssError {
     SssError::Reconstruct(ReconstructError::Device { detail: error.to_string() })
 }

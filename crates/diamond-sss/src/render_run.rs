@@ -2,11 +2,13 @@
 use crate::picture::encode_png_linear;
 use crate::relight::{render_lights, render_sum};
 use crate::{CameraChoice, LightChoice, RunRecord, SssError, cameras_of, encode_exr, write_output};
+use diamond_gpu::{Device, DeviceChoice, DeviceRelighter};
 use diamond_image::Image;
 use diamond_light::OlatLight;
-use diamond_reconstruct::Model;
+use diamond_reconstruct::{Model, Relighter as _};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// What to render.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -25,6 +27,8 @@ pub struct RenderOptions {
     pub medium: Option<String>,
     /// Linear light as EXR instead of sRGB as PNG.
     pub linear: bool,
+    /// Where pictures are made; on the CPU where absent.
+    pub device: Option<DeviceChoice>,
     /// Stops by which pictures are brighter than the model says; every stop doubles the radiance.
     pub exposure: f32,
 }
@@ -34,6 +38,8 @@ pub fn render_folder(
     options: &RenderOptions,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<PathBuf>, SssError> {
+    // Before anything is read: a device that is not there is a wrong option.
+    let device = options.device.map_or(Ok(None), Device::open).map_err(|e| SssError::Usage(e.to_string()))?;
     let mut model = Model::load(&options.folder)?;
     if let Some(changes) = &options.medium {
         crate::edit_medium(&mut model, changes)?;
@@ -75,7 +81,19 @@ pub fn render_folder(
         progress(written.len(), total);
         Ok(())
     };
-    let renderer = crate::AtOnce::default().renderer(&model);
+    let mut renderer = crate::AtOnce::default().renderer(&model);
+    if let Some(device) = device {
+        let relighter = DeviceRelighter::new(Arc::new(device)).map_err(crate::reconstruct_run::device_error)?;
+        let name = relighter.name().to_owned();
+        let lacking;
+        (renderer, lacking) = renderer.relight_by(Box::new(relighter));
+        if let Some(lacking) = lacking {
+            return Err(SssError::Usage(format!(
+                "{name} cannot render this model, it lacks {lacking}; use --device cpu"
+            )));
+        }
+    }
+    let renderer = renderer;
     for (name, camera) in cameras {
         let camera = options.size.map_or(camera, |(w, h)| camera.resized(w, h));
         if mixes.iter().all(|m| m.lights.len() == 1) {

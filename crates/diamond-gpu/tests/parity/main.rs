@@ -3,11 +3,15 @@
 mod compare;
 mod components;
 mod reconstruction;
+mod relight;
 mod scenes;
+mod step_parts;
+mod steps;
 
 use compare::{Difference, relative_l2};
 use diamond_gpu::{
-    COMPONENTS, Device, DeviceChoice, GpuError, HostState, RasterScene, Rasterizer, STAGES, Side, Sources, adapters,
+    COMPONENTS, Device, DeviceChoice, GpuError, HostState, RasterScene, Rasterizer, STAGES, STEP_PARTS, Side, Sources,
+    adapters,
 };
 use diamond_splat::{Cutoff, Gaussians, Raster, RasterPull, rasterize};
 use libtest_mimic::{Arguments, Failed, Trial};
@@ -77,6 +81,21 @@ fn tests() -> Vec<(String, Test)> {
             }),
         ));
         tests.push((format!("planted, {}", row.name), Box::new(move |_| planted_component(row.name))));
+    }
+    for scenario in &steps::SCENARIOS {
+        let test: Test = Box::new(move |device| steps::whole(device, scenario));
+        tests.push((format!("step, {}", scenario.name), test));
+    }
+    let test: Test = Box::new(steps::same_bits);
+    tests.push(("step, the same bits".into(), test));
+    tests.push(("parts of a step".into(), Box::new(parts)));
+    let test: Test = Box::new(relight::agrees);
+    tests.push(("relit, many lights".into(), test));
+    for name in ["pack_transport", "join_transport"] {
+        tests.push((format!("planted, {name}"), Box::new(move |_| planted_relit(name))));
+    }
+    for row in STEP_PARTS {
+        tests.push((format!("planted, {}", row.name), Box::new(move |_| planted_part(row.name))));
     }
     for row in STAGES {
         tests.push((format!("planted, {}", row.name), Box::new(move |_| planted(row.name))));
@@ -227,6 +246,26 @@ fn plants(stage: &str) -> Option<(&'static str, &'static str, &'static str)> {
         "mask_bce" => ("mask_bce.wgsl", "/ (cut * through)", "/ (cut * max(through, 0.01))"),
         "adam_step" => ("adam.wgsl", "const BETA_2: f32 = 0.999;", "const BETA_2: f32 = 0.99901;"),
         "record_view" => ("density_stats.wgsl", "before.y + 1.0", "before.y + 2.0"),
+        "activate" => {
+            ("activate.wgsl", "sigmoid_of(raw[places.opacity + i])", "sigmoid_of(raw[places.opacity + i] * 1.001)")
+        }
+        "residual_inputs" => ("residual_inputs.wgsl", "light.xyz, light.w", "light.xyz * 1.001, light.w"),
+        "residual_outputs" => ("residual_outputs.wgsl", "part = fma(", "part = 1.001 * fma("),
+        "medium_rows" => ("medium_rows.wgsl", "f2.yzw + sent", "f2.yzw + sent * 1.001"),
+        "visibility_fit" => ("visibility_fit.wgsl", "var sum = 0.5;", "var sum = 0.5001;"),
+        "image_terms" => ("image_terms.wgsl", "select(0.125, 0.25, j == 1u)", "select(0.125, 0.24, j == 1u)"),
+        "medium_pull" => ("medium_pull.wgsl", "let d_normal = light.xyz", "let d_normal = 1.01 * light.xyz"),
+        "residual_gather" => ("residual_gather.wgsl", "fma(d[c], y[k]", "fma(1.001 * d[c], y[k]"),
+        "residual_scatter" => ("residual_scatter.wgsl", "d_inputs[at + 42u + k]", "d_inputs[at + 41u + k]"),
+        "activate_pull" => ("activate_pull.wgsl", "d_raw[q + 3u] += g.form_a.z;", "d_raw[q + 3u] += g.form_a.y;"),
+        "visibility_term" => ("visibility_term.wgsl", "f32(samples[n].y)", "min(f32(samples[n].y), 1.0)"),
+        "transfer_smoothness" => ("transfer_smoothness.wgsl", "view.weight * 2.0", "view.weight"),
+        "sampled_inputs" => ("sampled_inputs.wgsl", "-s.viewer, dot", "s.viewer, dot"),
+        "sampled_pull" => ("sampled_pull.wgsl", "fma(transfer[at + k]", "fma(0.99 * transfer[at + k]"),
+        "clamp_scales" => ("clamp_scales.wgsl", "limits.high, v >", "limits.high + 0.001, v >"),
+        "pack_transport" => ("pack_transport.wgsl", "packed[at + 1u] = residual.y", "packed[at + 1u] = residual.z"),
+        "join_transport" => ("join_transport.wgsl", "5u * slot[0]", "5u * min(slot[0], 1u)"),
+        "reduce" => ("reduce.wgsl", "if lane < half {", "if lane < half - 1u {"),
         _ => return None,
     })
 }
@@ -241,6 +280,35 @@ fn planted_component(name: &'static str) -> Result<(), String> {
         None => Err(format!("an error in {name} was not found")),
         Some(row) if row.name == name => Ok(()),
         Some(row) => Err(format!("an error in {name} was taken for one in {}", row.name)),
+    }
+}
+
+fn parts(device: &'static Arc<Device>) -> Result<(), String> {
+    let worst = step_parts::parts(device).map_err(|(name, what)| format!("{name}: {what}"))?;
+    let worst: Vec<String> = worst.iter().map(|(name, error)| format!("{name} {error:.1e}")).collect();
+    println!("parity: parts of a step: {}", worst.join(", "));
+    Ok(())
+}
+
+/// Pictures under many lights are found wrong.
+fn planted_relit(name: &'static str) -> Result<(), String> {
+    let (file, from, to) = plants(name).ok_or("no error is planted")?;
+    let sources = Sources::default().with_edit(file, from, to).ok_or("there is nothing to replace")?;
+    match relight::agrees(&Arc::new(open(sources)?)) {
+        Ok(()) => Err(format!("an error in {name} was not found")),
+        Err(what) if what.contains("relative error") => Ok(()),
+        Err(what) => Err(what),
+    }
+}
+
+/// The first part of a step that is found wrong is the one where the error is.
+fn planted_part(name: &'static str) -> Result<(), String> {
+    let (file, from, to) = plants(name).ok_or("no error is planted in this part")?;
+    let sources = Sources::default().with_edit(file, from, to).ok_or("there is nothing to replace")?;
+    match step_parts::parts(&Arc::new(open(sources)?)) {
+        Ok(_) => Err(format!("an error in {name} was not found")),
+        Err((found, _)) if found == name => Ok(()),
+        Err((found, what)) => Err(format!("an error in {name} was taken for one in {found}: {what}")),
     }
 }
 

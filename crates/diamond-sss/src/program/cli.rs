@@ -251,8 +251,8 @@ pub struct ReconstructArguments {
     /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: the configuration]
     #[arg(long, value_name = "NAME")]
     pub instruction_set: Option<InstructionChoice>,
-    /// Where training pictures are blended, forward and backward: cpu, gpu, gpu:N (`diamond devices` lists them), or auto (a GPU
-    /// that is not software, else cpu). Everything else runs on the CPU
+    /// Where training steps are made: cpu, gpu, gpu:N (`diamond devices` lists them), or auto (a GPU that is not software, else cpu). What a device
+    /// cannot do of a step is said, and the step is made on the CPU
     #[arg(long, value_name = "NAME", default_value = "cpu")]
     pub device: DeviceChoice,
     /// What the process may take in memory: 512MiB, 2GiB, bytes. Caches shrink first, which changes no result, then the
@@ -333,6 +333,9 @@ pub struct RenderArguments {
     /// Brighter by so many stops (each doubles the light), or darker if negative
     #[arg(long, value_name = "EV", default_value_t = 0.0, allow_hyphen_values = true, value_parser = stops)]
     pub exposure: f32,
+    /// Where pictures are made: cpu, gpu, gpu:N (`diamond devices` lists them), or auto (a GPU that is not software, else cpu). Rays run on the CPU
+    #[arg(long, value_name = "NAME", default_value = "cpu")]
+    pub device: DeviceChoice,
     /// auto, portable (the same bits on every machine), avx2, avx512 or neon [default: auto]
     #[arg(long, value_name = "NAME")]
     pub instruction_set: Option<InstructionChoice>,
