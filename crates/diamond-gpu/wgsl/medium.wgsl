@@ -11,6 +11,17 @@
 const NEIGHBOURS: u32 = 6u;
 const MAX_RATIO: f32 = 1e15;
 
+// Share of what is sent that is seen: less from behind. No gradient goes through it.
+fn front(i: u32, normal: vec3<f32>) -> f32 {
+    let away = view.eye - means[i].xyz;
+    let distance = sqrt(dot(away, away));
+    var viewer = vec3<f32>(0.0, 0.0, 1.0);
+    if distance >= SMALLEST {
+        viewer = away / distance;
+    }
+    return clamp(1.0 + dot(normal, viewer), 0.0, 1.0);
+}
+
 fn untinted(i: u32, normal: vec3<f32>) -> vec3<f32> {
     var around = vec3<f32>(0.0);
     for (var k = 0u; k < NEIGHBOURS; k++) {
@@ -26,5 +37,5 @@ fn untinted(i: u32, normal: vec3<f32>) -> vec3<f32> {
     let falls = ratio * ratio;
     let over_falloff = select(0.0, 1.0 / falls, falls > SMALLEST);
     let cos_theta_i = max(dot(normal, light.xyz), 0.0);
-    return around * (over_falloff / view.whole) + view.local * (visibility[i] * cos_theta_i);
+    return (around * (over_falloff / view.whole) + view.local * (visibility[i] * cos_theta_i)) * front(i, normal);
 }

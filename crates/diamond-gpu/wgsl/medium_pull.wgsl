@@ -29,7 +29,7 @@ fn medium_pull(
     let light = toward_light(view, means[i].xyz);
     let seen = visibility[i];
     if dot(normal, light.xyz) > 0.0 && seen > 0.0 {
-        let d_cosine = seen * dot(d * features[4u * i].xyz * view.tint, view.local);
+        let d_cosine = seen * front(i, normal) * dot(d * features[4u * i].xyz * view.tint, view.local);
         let d_normal = light.xyz * d_cosine;
         d_features[4u * i + 1u] += vec4<f32>(0.0, 0.0, d_normal.xy);
         d_features[4u * i + 2u] += vec4<f32>(d_normal.z, 0.0, 0.0, 0.0);

@@ -174,6 +174,12 @@ impl Probe {
         Ok(sum)
     }
 
+    /// Share of what a medium sends out of a Gaussian that the camera sees.
+    fn front(&self, i: usize) -> f32 {
+        let away = self.stepped.shots.cameras[0].pose.centre() - self.activated.gaussians.means[i];
+        (1.0 + self.activated.normals[i].dot(away.normalize())).clamp(0.0, 1.0)
+    }
+
     /// What a medium sends out of each Gaussian before the tint [eq:medium-residual], from the surfels that the device has.
     fn untinted(&self) -> Result<Vec<Vec3>, String> {
         let Some(term) = &self.model().medium else { return Err("there is no medium".into()) };
@@ -189,7 +195,7 @@ impl Probe {
                 let around = term.attachment().rgb(i, &leaving);
                 let falls = lamp.incidence(at, falloff).irradiance.x;
                 let cosine = g.normals[i].dot(lamp.incidence(at, Falloff::None).direction).max(0.0);
-                around / falls / whole + local * (self.visibility[i] * cosine)
+                (around / falls / whole + local * (self.visibility[i] * cosine)) * self.front(i)
             })
             .collect())
     }
@@ -245,7 +251,7 @@ impl Probe {
             let d = Vec3::from_slice(&row[9..12]);
             colors.push(Vec3::from_slice(&row[..3]) + 2.0 * d * untinted[i]);
             let lit = a.normals[i].dot(directions[i]) > 0.0 && self.visibility[i] > 0.0;
-            let d_cosine = self.visibility[i] * (2.0 * d * a.base_color[i]).dot(local);
+            let d_cosine = self.visibility[i] * self.front(i) * (2.0 * d * a.base_color[i]).dot(local);
             let own = if lit { directions[i] * d_cosine } else { Vec3::ZERO };
             normals.push(Vec3::from_slice(&row[6..9]) + own);
         }
