@@ -31,6 +31,7 @@ mod exposure;
 mod facts;
 mod forward;
 mod instruction_choice;
+mod light_half;
 mod mcmc;
 mod medium_fit;
 mod medium_term;

@@ -9,6 +9,7 @@
 //! A picture has the same bits however many lights it is rendered among.
 use crate::channel_layout::ChannelLayout;
 use crate::forward::{Settings, raster_config};
+use crate::light_half::LightHalf;
 use crate::needs::RenderNeeds;
 use crate::region::Region;
 use crate::rows::{LightRows, Rows, VisibilitySource, input_scaling, residual_inputs, transfer_config, write_geometry};
@@ -48,29 +49,6 @@ pub struct Renderer<'m> {
     /// Who makes radiance, if not the CPU.
     pub(crate) relighter: Option<Mutex<Box<dyn Relighter>>>,
     kept: Mutex<BTreeMap<LightKey, Arc<LightHalf>>>,
-}
-
-/// What a light is to Gaussians, whatever the view.
-pub(crate) struct LightHalf {
-    /// Empty where nothing reads it.
-    pub visibility: Vec<f32>,
-    /// [`MediumTerm::sent`]; empty without a medium.
-    pub medium: Vec<Vec3>,
-}
-
-impl LightHalf {
-    /// Of `gaussians` Gaussians.
-    pub fn bytes(gaussians: usize, visibility: bool, medium: bool) -> usize {
-        gaussians * (usize::from(visibility) * size_of::<f32>() + usize::from(medium) * size_of::<Vec3>())
-    }
-
-    /// The same for some of the Gaussians.
-    fn of(&self, rows: &[u32]) -> Self {
-        Self {
-            visibility: rows.iter().filter_map(|&i| self.visibility.get(i as usize).copied()).collect(),
-            medium: rows.iter().filter_map(|&i| self.medium.get(i as usize).copied()).collect(),
-        }
-    }
 }
 
 /// What a view sees of the shape of a model.
