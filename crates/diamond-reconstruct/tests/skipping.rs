@@ -227,7 +227,9 @@ fn views_share_the_visibility_of_lights() {
     assert!(model.config.visibility.traced);
     let cameras: Vec<_> = run.capture().train.iter().take(3).map(|view| view.camera).collect();
     let lights: Vec<OlatLight> = run.capture().train[0].shots.iter().map(|shot| shot.light).collect();
-    let bytes_of_one = 4 * model.parameters.len();
+    // Visibility, and three channels from the medium.
+    assert!(model.medium.is_some());
+    let bytes_of_one = 16 * model.parameters.len();
     for bytes in [usize::MAX, 2 * bytes_of_one + 1] {
         let keeping = Renderer::new(&model).with_kept_visibility(bytes);
         for camera in &cameras {
