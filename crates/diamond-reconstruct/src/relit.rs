@@ -1,7 +1,7 @@
 //! Pictures of a view under many lights by a [`Relighter`]: what the renderer prepares for it.
 use crate::forward::{Settings, raster_config};
+use crate::light_half::LightHalf;
 use crate::relighter::{RelightLight, RelightView, Relighter, device};
-use crate::render::LightHalf;
 use crate::rows::input_scaling;
 use crate::{Attribute, MediumTerm, ReconstructError, Renderer, error};
 use diamond_camera::Camera;
