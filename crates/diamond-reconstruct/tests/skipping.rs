@@ -4,7 +4,7 @@ use diamond_dataset::{Capture, OpenOptions, Selection};
 use diamond_light::OlatLight;
 use diamond_reconstruct::{
     Attribute, CaptureFacts, Config, DensityStrategy, MetalVariant, Model, Needs, Reconstruction, RenderNeeds,
-    Renderer, TensorFile,
+    Renderer, SubsurfaceModel, TensorFile,
 };
 use glam::Vec3;
 
@@ -18,7 +18,7 @@ fn capture() -> Capture {
 fn short(preset: &str) -> Config {
     let mut config = Config::preset(preset).expect("a preset");
     config.steps = 40;
-    config.subsurface.model = diamond_reconstruct::SubsurfaceModel::Mlp;
+    config.subsurface.model = SubsurfaceModel::Mlp;
     config.initial.count = 500;
     config.density.strategy = DensityStrategy::None;
     config.visibility.every_steps = 5;
@@ -69,7 +69,7 @@ fn a_step_agrees_with_everything_computed() {
     change("no subsurface", &|c| (c.residual.network, c.residual.transfer) = (false, false));
     change("no shadows", &|c| c.shading.surface_visibility = false);
     change("with a medium", &|c| {
-        c.subsurface.model = diamond_reconstruct::SubsurfaceModel::ProfileMlp;
+        c.subsurface.model = SubsurfaceModel::ProfileMlp;
         (c.subsurface.surfels, c.subsurface.seeds, c.subsurface.resolution, c.subsurface.widths) = (500, 800, 28, 6);
     });
     change("no SSIM", &|c| c.loss.ssim = 0.0);
@@ -219,17 +219,24 @@ fn hidden_gaussians_are_not_pulled() {
 /// Visibility that is kept from one view to the next does not change a bit, nor does room for a few of the lights only.
 #[test]
 fn views_share_the_visibility_of_lights() {
+    views_share(SubsurfaceModel::Mlp, 4);
+    // Three channels from the medium beside visibility.
+    views_share(SubsurfaceModel::ProfileMlp, 16);
+}
+
+fn views_share(subsurface: SubsurfaceModel, bytes: usize) {
     let mut config = short("resolved");
     config.initial.count = 800;
+    config.subsurface.model = subsurface;
+    (config.subsurface.seeds, config.subsurface.surfels, config.subsurface.resolution) = (800, 500, 28);
     let mut run = Reconstruction::new(capture(), &config).expect("starts");
     (0..3).for_each(|_| assert!(run.step().is_ok()));
     let model = run.model().expect("a model").clone();
     assert!(model.config.visibility.traced);
     let cameras: Vec<_> = run.capture().train.iter().take(3).map(|view| view.camera).collect();
     let lights: Vec<OlatLight> = run.capture().train[0].shots.iter().map(|shot| shot.light).collect();
-    // Visibility, and three channels from the medium.
-    assert!(model.medium.is_some());
-    let bytes_of_one = 16 * model.parameters.len();
+    assert_eq!(model.medium.is_some(), subsurface.has_medium());
+    let bytes_of_one = bytes * model.parameters.len();
     for bytes in [usize::MAX, 2 * bytes_of_one + 1] {
         let keeping = Renderer::new(&model).with_kept_visibility(bytes);
         for camera in &cameras {
