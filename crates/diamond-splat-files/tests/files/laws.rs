@@ -78,8 +78,10 @@ proptest! {
         let largest = cloud.means.iter().map(|m| m.abs().max_element()).fold(0.0f32, f32::max);
         // 2¹⁸ steps to the largest coordinate, or 4096 per unit where that is finer.
         let step = (f64::from(largest) / f64::from(1 << 18)).min(1.0 / 4096.0).max(1.0 / f64::from(1 << 23));
+        // Rotation: three components to h = half of a step of 1/(511·√2); where all four are ½ the fourth is then off by 3·h, the angle by 2·h·√12.
+        let angle = 2.0 * 12f64.sqrt() * 0.51 / (511.0 * 2f64.sqrt());
         let limits =
-            [0.5001 * step, 0.5001 / 16.0, 0.5001 / 255.0, 0.0036, 0.5001 / 255.0 / 0.15, 0.5001 / 128.0];
+            [0.5001 * step, 0.5001 / 16.0, 0.5001 / 255.0, angle, 0.5001 / 255.0 / 0.15, 0.5001 / 128.0];
         within(differences(&cloud, &back), limits)?;
         prop_assert_eq!(round_trip(&back, SplatFormat::Spz, version).sh, back.sh);
     }
