@@ -17,6 +17,7 @@ Examples:
   cargo xtask bench splat                           time and error of the rasteriser
   cargo xtask bench transport -- --mitsuba python3  time and error of the path tracer, beside Mitsuba
   cargo xtask bench prior                           levels of the physical prior against the path tracer
+  cargo xtask bench gpu                             time of every stage on a GPU, of a step, of many lights
   cargo xtask eval out/grid.toml --print            the commands of a grid of reconstructions that are not done
   cargo xtask tune out/tune.toml                    search settings on training images that are held out
   cargo xtask tidy --rules                          the house rules and their reasons

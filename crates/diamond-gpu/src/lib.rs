@@ -60,7 +60,7 @@ pub use host_state::{HostState, RasterScene, Side};
 pub use kernels::{Kernel, Module, Sources};
 pub use losses::{mask_bce, photometric};
 pub use network::{mlp_forward, mlp_pull};
-pub use rasterizer::{DevicePullback, DeviceStats, Rasterizer};
+pub use rasterizer::{DevicePullback, DeviceStats, Rasterizer, StageTime};
 pub use relighter::DeviceRelighter;
 pub use shading::{Lighting, shade, shade_pull};
 pub use shape::{Column, Shape};

@@ -138,6 +138,62 @@ impl Rasterizer {
     }
 }
 
+/// What a stage takes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StageTime {
+    /// Its name, as in [`STAGES`].
+    pub name: &'static str,
+    /// Mean over the repeats, seconds.
+    pub seconds: f64,
+    /// Bytes of the arrays that its kernels are handed: what it moves if each number is read or written once.
+    pub bytes: u64,
+}
+
+impl Rasterizer {
+    /// Makes a picture and its gradient, and then each stage by itself, `repeats` times in a row. Channels that go through the kernels in several pieces are
+    /// timed all together.
+    ///
+    /// # Errors
+    /// As [`Rasterizer::rasterize`] and [`DevicePullback::pull`].
+    pub fn time_stages(
+        &mut self,
+        gaussians: &Gaussians,
+        features: &Features,
+        camera: &Camera,
+        config: &RasterConfig,
+        d: &RasterGrad,
+        repeats: usize,
+    ) -> Result<(DeviceStats, Vec<StageTime>), GpuError> {
+        let (_, stats, last) = self.picture(gaussians, features, camera, config)?;
+        self.pull(last, d)?;
+        let device = &*self.device;
+        let mut times = Vec::with_capacity(STAGES.len());
+        for row in STAGES {
+            let steps = steps(row.stage, &last.shape);
+            let words = |step: &Step| match step {
+                Step::Clear(column) => last.shape.words(*column),
+                Step::Dispatch { bindings, .. } => bindings.iter().map(|(_, _, words)| *words).sum(),
+            };
+            let bytes = 4 * steps.iter().map(words).sum::<u64>();
+            let once = || -> Result<f64, GpuError> {
+                let mut encoder = device.device.create_command_encoder(&Default::default());
+                for _ in 0..repeats.max(1) {
+                    self.arrays.encode(device, &mut encoder, &steps)?;
+                }
+                let begun = std::time::Instant::now();
+                device.submit(encoder)?;
+                // Waits for all that was submitted.
+                self.arrays.read(device, &[(Column::Counts, 4)])?;
+                Ok(begun.elapsed().as_secs_f64() / repeats.max(1) as f64)
+            };
+            // The first time kernels may still be compiled.
+            once()?;
+            times.push(StageTime { name: row.name, seconds: once()?, bytes });
+        }
+        Ok((stats, times))
+    }
+}
+
 fn too_many(entries: u64) -> GpuError {
     GpuError::Limit { what: "lists of tiles", needed: entries.saturating_mul(8), limit: u64::from(u32::MAX) * 8 }
 }
