@@ -1,7 +1,8 @@
 //! The distance itself, and its gradient with respect to one picture.
 use crate::network::{Layer, Network, POOL_STRIDE};
 use candle_core::{DType, Device, Tensor, Var};
-use diamond_diffusion::nn::{Init, Source, VariablesBuilder, conv2d, max_pool2d};
+use diamond_diffusion::nn::{Init, Source, Variables, VariablesBuilder, conv2d, max_pool2d};
+use diamond_diffusion::published::Renamed;
 use diamond_diffusion::{DiffusionError, Result, read_weights};
 use diamond_image::Image;
 use std::path::Path;
@@ -138,6 +139,24 @@ impl Lpips {
         let (width, height, channels) = a.shape();
         let d_a = Image::from_vec(width, height, channels, d_a.flatten_all()?.to_vec1()?);
         Ok((distance.to_scalar()?, d_a.map_err(|_| missing())?))
+    }
+}
+
+impl Network {
+    /// Names and shapes of its weights, without memory for them.
+    pub fn shapes(self) -> Result<Variables> {
+        let builder = VariablesBuilder::new(Source::Shapes);
+        Lpips::build(self, self.layers(), &builder)?;
+        Ok(builder.finish().0)
+    }
+
+    /// What a name of torchvision's classifier, or of LPIPS's own file of heads, is here. The classifier's last layers are not used.
+    pub fn rename(self, name: &str) -> Renamed {
+        if name.starts_with("classifier.") || name.starts_with("scaling_layer.") {
+            return Renamed::Elsewhere;
+        }
+        // Dropout stands before each head there.
+        Renamed::As(name.replace(".model.1.", "."))
     }
 }
 
@@ -324,8 +343,6 @@ mod tests {
                 assert!(reason.contains(network.variable()), "{reason}");
             }
         }
-        let builder = VariablesBuilder::new(Source::Shapes);
-        Lpips::build(Network::Vgg, Network::Vgg.layers(), &builder).unwrap();
-        assert_eq!(builder.finish().0.parameters(), 14_714_688 + 64 + 128 + 256 + 512 + 512);
+        assert_eq!(Network::Vgg.shapes().unwrap().parameters(), 14_714_688 + 64 + 128 + 256 + 512 + 512);
     }
 }

@@ -15,6 +15,8 @@
 //! safetensors.torch.save_file(keep, "lpips-vgg.safetensors")
 //! ```
 //!
+//! `diamond models check` says whether a file fits, `diamond models convert` renames.
+//!
 //! ```no_run
 //! use diamond_lpips::{Lpips, Network};
 //! # let (a, b) = (diamond_image::Image::new(64, 64, 3), diamond_image::Image::new(64, 64, 3));

@@ -6,7 +6,7 @@ mod signals;
 mod synth;
 
 use clap::Parser;
-use cli::{Cli, Command, RenderArguments};
+use cli::{Cli, Command, ModelsCommand, RenderArguments};
 use diamond_reconstruct::{Config, InstructionChoice, PRESETS};
 use diamond_sss::{CameraChoice, LightChoice, PlanOptions, RenderOptions, SssError};
 use progress::Counter;
@@ -113,6 +113,15 @@ fn run(command: Command) -> Result<(), SssError> {
             report_export(&output, &exported);
             Ok(())
         }
+        Command::Models(command) => models(command),
+        Command::Train { shards, output, steps, batch, size, rate, seed, save_every, held_out, resume } => {
+            let wish = diamond_sss::TrainOptions { steps, batch, size, rate, seed, save_every, held_out, resume };
+            let mut counter = Counter::new("training");
+            let text = diamond_sss::train_on_shards(&shards, &output, &wish, &mut |done, all| counter.show(done, all))?;
+            counter.finish();
+            print(&text);
+            Ok(())
+        }
         Command::Devices => {
             print(&diamond_sss::devices_text());
             Ok(())
@@ -129,6 +138,17 @@ fn run(command: Command) -> Result<(), SssError> {
 
 fn choose_instructions(choice: Option<InstructionChoice>) -> Result<(), SssError> {
     choice.unwrap_or_default().apply().map(drop).map_err(|e| SssError::Usage(e.to_string()))
+}
+
+fn models(command: ModelsCommand) -> Result<(), SssError> {
+    match command {
+        ModelsCommand::Inspect { file } => print(&diamond_sss::inspect_weights(&file)?),
+        ModelsCommand::Check { file, model } => print(&diamond_sss::check_weights(&file, &model)?),
+        ModelsCommand::Convert { file, output, model, numbers } => {
+            print(&diamond_sss::convert_weights(&file, &output, &model, &numbers)?);
+        }
+    }
+    Ok(())
 }
 
 fn inspect_splats(path: &Path, output: Option<PathBuf>) -> Result<(), SssError> {

@@ -178,6 +178,56 @@ Shards that are there are kept, so the same command goes on after an interruptio
         #[arg(long, value_name = "SIZE", default_value = "64MiB")]
         shard_size: ByteSize,
     },
+    /// Files of network weights (safetensors): what they are, whether they fit, and into our names
+    #[command(
+        subcommand,
+        after_help = "Examples:
+  diamond models inspect v1-5-pruned.safetensors
+  diamond models check v1-5-pruned.safetensors --model sd1-unet
+  diamond models convert v1-5-pruned.safetensors -o unet.safetensors --model sd1-unet --numbers f16
+
+No weights are contained or fetched: they are files that you have, under their own licences."
+    )]
+    Models(ModelsCommand),
+    /// Train the relighter on shards: what a view looks like under lights that it was not photographed under
+    #[command(after_help = "Examples:
+  diamond shards family/* -o shards
+  diamond train shards -o relighter --steps 5000
+  diamond train shards -o relighter --steps 5000 --resume
+
+The folder gets checkpoint.safetensors, curve.csv and, at the end, model.safetensors. Runs on the CPU; no other command
+uses the model yet.")]
+    Train {
+        /// Folder of shards, with index.json
+        shards: PathBuf,
+        /// Folder for the run
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Steps
+        #[arg(long, default_value_t = 5000, value_parser = clap::value_parser!(u64).range(1..))]
+        steps: u64,
+        /// Examples of a step
+        #[arg(long, default_value_t = 4, value_parser = at_least_one)]
+        batch: usize,
+        /// Pixels of a side that the network works at, a multiple of 8
+        #[arg(long, default_value_t = 64)]
+        size: usize,
+        /// Largest learning rate
+        #[arg(long, default_value_t = 3e-4)]
+        rate: f64,
+        /// Seed of every random choice
+        #[arg(long, default_value_t = 0)]
+        seed: u64,
+        /// Steps between checkpoints
+        #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+        save_every: u64,
+        /// Examples of the shards' split `test` that the result is measured on
+        #[arg(long, default_value_t = 32)]
+        held_out: usize,
+        /// Go on from the checkpoint, with the same options
+        #[arg(long)]
+        resume: bool,
+    },
     /// List what this machine has to compute on
     #[command(after_help = "Example:\n  diamond devices")]
     Devices,
@@ -186,6 +236,38 @@ Shards that are there are kept, so the same command goes on after an interruptio
     Presets {
         /// Name of a preset
         name: Option<String>,
+    },
+}
+
+/// What to do with a file of weights.
+#[derive(Debug, Subcommand)]
+pub enum ModelsCommand {
+    /// Say what a file holds and which model it fits; reads its header only
+    Inspect {
+        /// The file
+        file: PathBuf,
+    },
+    /// Compare names and shapes with a model; reads the header only. Exit code 3 where it does not fit
+    Check {
+        /// The file
+        file: PathBuf,
+        /// Name of a model, as `diamond models inspect` lists them
+        #[arg(long)]
+        model: String,
+    },
+    /// Write the weights of a model under our names
+    Convert {
+        /// The file
+        file: PathBuf,
+        /// File to write (.safetensors)
+        #[arg(short, long)]
+        output: PathBuf,
+        /// Name of a model, as `diamond models inspect` lists them
+        #[arg(long)]
+        model: String,
+        /// How numbers are stored: f32, f16 (at most 65504) or bf16
+        #[arg(long, default_value = "f16")]
+        numbers: String,
     },
 }
 
