@@ -7,7 +7,7 @@
 //! | [`unet`] | the networks: one family, from published sizes to small ones |
 //! | [`FirstStage`] | from pictures to what is diffused and back: [`KlVae`], [`SpaceToDepth`], [`Identity`] |
 //! | [`ray_map`], [`light_code`] | cameras and lights as numbers that a network can read |
-//! | [`relight`] | the relighter: ratios of pictures, physical hints, examples from shards |
+//! | [`relight`] | the relighter: ratios of pictures to predictions, physical hints, examples from shards, errors on held-out objects |
 //! | [`train`] | the objective, AdamW, steps that can be resumed |
 //! | [`read_weights`], [`WeightsHeader`], [`published`] | files of weights, and names of published ones |
 //! | [`Noise`] | seeded random tensors |
@@ -42,4 +42,4 @@ pub use ray_embedding::{ray_embedding, ray_map, relative_camera};
 pub use sampler::{Sampler, Spacing, guided, shared_noise};
 pub use schedule::{Level, Schedule};
 pub use vae::{KlVae, VaeConfig};
-pub use weights::{NumberType, StoredTensor, WeightsHeader, read_weights, write_weights};
+pub use weights::{NumberType, StoredTensor, WeightsHeader, read_weights, weights_of_bytes, write_weights};

@@ -87,6 +87,12 @@ impl WeightsHeader {
         let io = |e: std::io::Error| file_error(path, format!("cannot be read: {e}"));
         let mut file = File::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
+        Self::read_from(path, &mut file, size)
+    }
+
+    /// As [`WeightsHeader::read`], of something that is `size` bytes long; `path` names it in errors.
+    fn read_from(path: &Path, file: &mut impl Read, size: u64) -> Result<Self> {
+        let io = |e: std::io::Error| file_error(path, format!("cannot be read: {e}"));
         let mut length = [0u8; 8];
         file.read_exact(&mut length).map_err(|_| not_safetensors(path, "it is shorter than 8 bytes"))?;
         let length = u64::from_le_bytes(length);
@@ -150,8 +156,20 @@ fn not_safetensors(path: &Path, why: &str) -> DiffusionError {
 /// The floating-point tensors of a file, as `f32` on the CPU. NaN and infinity are refused.
 pub fn read_weights(path: &Path) -> Result<BTreeMap<String, Tensor>> {
     let header = WeightsHeader::read(path)?;
+    let mut file = File::open(path).map_err(|e| file_error(path, format!("cannot be read: {e}")))?;
+    tensors_of(path, &header, &mut file)
+}
+
+/// As [`read_weights`], of a file's bytes, and with its header; `origin` names them in errors.
+pub fn weights_of_bytes(bytes: &[u8], origin: &str) -> Result<(WeightsHeader, BTreeMap<String, Tensor>)> {
+    let (path, mut reader) = (Path::new(origin), std::io::Cursor::new(bytes));
+    let header = WeightsHeader::read_from(path, &mut reader, bytes.len() as u64)?;
+    let tensors = tensors_of(path, &header, &mut reader)?;
+    Ok((header, tensors))
+}
+
+fn tensors_of(path: &Path, header: &WeightsHeader, file: &mut (impl Read + Seek)) -> Result<BTreeMap<String, Tensor>> {
     let io = |e: std::io::Error| file_error(path, format!("cannot be read: {e}"));
-    let mut file = File::open(path).map_err(io)?;
     let mut tensors = BTreeMap::new();
     for (name, stored) in &header.tensors {
         let mut bytes = vec![0u8; (stored.range.1 - stored.range.0) as usize];

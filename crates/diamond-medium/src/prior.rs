@@ -80,7 +80,7 @@ impl Prior {
         pictures.prepare(&chosen.iter().map(|p| *p.light).collect::<Vec<_>>())?;
         for photograph in &chosen {
             let sight = Sight::new(pictures.surface(), photograph.camera);
-            let predicted = over_mask(pictures.radiance(&sight, photograph.light)?, &sight.coverage(), photograph.mask);
+            let predicted = sight.over_mask(pictures.radiance(&sight, photograph.light)?, photograph.mask);
             let value = |pixel: usize| {
                 let inside = photograph.mask.is_none_or(|m| m.data()[pixel] >= 0.5);
                 let of = |image: &'_ Image| [0, 1, 2].map(|c| image.data()[3 * pixel + c]);
@@ -111,17 +111,6 @@ impl Prior {
     }
 }
 
-/// A picture whose outline is the photographs': radiance where the surface is met, times the photographs' coverage. Without a mask as it is.
-fn over_mask(mut radiance: Image, coverage: &Image, mask: Option<&Mask>) -> Image {
-    let Some(mask) = mask else { return radiance };
-    for (i, pixel) in radiance.data_mut().chunks_exact_mut(3).enumerate() {
-        let met = coverage.data()[i];
-        let factor = if met > 0.0 { mask.data()[i] / met } else { 0.0 };
-        pixel.iter_mut().for_each(|v| *v *= factor);
-    }
-    radiance
-}
-
 impl Source for Prior {
     fn method(&self) -> String {
         format!("prior: {}", self.pictures.medium().kind())
@@ -145,7 +134,7 @@ impl Source for Prior {
                 Some(shot) => capture.observation(shot)?.mask.clone(),
                 None => None,
             };
-            let radiance = over_mask(self.pictures.radiance(sight, &target.light)?, &coverage, photographed.as_ref());
+            let radiance = sight.over_mask(self.pictures.radiance(sight, &target.light)?, photographed.as_ref());
             let mut confidence = sight.mean_of(&self.error);
             for (i, c) in confidence.data_mut().iter_mut().enumerate() {
                 let mask = photographed.as_ref().map(|m| m.data()[i]);

@@ -1,7 +1,7 @@
 //! Pictures of a medium in its surface, by rays: no Gaussians, no network.
 use crate::{Attachment, Exitance, Medium, MediumError, Surface};
 use diamond_camera::Camera;
-use diamond_image::Image;
+use diamond_image::{Image, Mask};
 use diamond_light::{Falloff, OlatLight};
 use diamond_pathtrace::{Facing, NO_PRIMITIVE};
 use diamond_shading::{BrdfModel, Material};
@@ -64,6 +64,46 @@ impl Sight {
         let mut share = Image::new(self.width, self.height, 1);
         self.pixels.iter().for_each(|p| share.data_mut()[*p as usize] += 1.0 / (RAYS * RAYS) as f32);
         share
+    }
+
+    /// View-space z where rays meet the surface, the mean over those of a pixel, 0 where none does. `camera` is the one that it was made for.
+    pub fn depth(&self, camera: &Camera) -> Image {
+        self.mean_over_rays(1, |i| [camera.pose.transform_point(self.positions[i]).z])
+    }
+
+    /// Unit normals in world axes as shading uses them, 0 where no ray meets the surface.
+    pub fn normals(&self) -> Image {
+        let mut normals = self.mean_over_rays(3, |i| self.shading[i].to_array());
+        for n in normals.data_mut().chunks_exact_mut(3) {
+            n.copy_from_slice(&Vec3::from_slice(n).normalize_or_zero().to_array());
+        }
+        normals
+    }
+
+    fn mean_over_rays<const N: usize>(&self, channels: usize, value: impl Fn(usize) -> [f32; N]) -> Image {
+        let mut mean = Image::new(self.width, self.height, channels);
+        let mut count = vec![0.0f32; self.width * self.height];
+        for (i, pixel) in self.pixels.iter().enumerate() {
+            let at = *pixel as usize;
+            mean.data_mut()[at * channels..][..channels].iter_mut().zip(value(i)).for_each(|(sum, v)| *sum += v);
+            count[at] += 1.0;
+        }
+        mean.data_mut().chunks_exact_mut(channels).zip(&count).for_each(|(sum, n)| {
+            sum.iter_mut().for_each(|v| *v /= n.max(1.0));
+        });
+        mean
+    }
+
+    /// A picture whose outline is the photographs': radiance where the surface is met, times the photographs' coverage. Without a mask as it is.
+    pub fn over_mask(&self, mut radiance: Image, mask: Option<&Mask>) -> Image {
+        let Some(mask) = mask else { return radiance };
+        let coverage = self.coverage();
+        for (i, pixel) in radiance.data_mut().chunks_exact_mut(3).enumerate() {
+            let met = coverage.data()[i];
+            let factor = if met > 0.0 { mask.data()[i] / met } else { 0.0 };
+            pixel.iter_mut().for_each(|v| *v *= factor);
+        }
+        radiance
     }
 
     /// One channel: at each pixel the mean over its rays that meet the surface of the values of surfels, 0 where none does.
@@ -242,5 +282,20 @@ mod tests {
         for p in (0..48 * 48).filter(|p| coverage.data()[*p] == 1.0) {
             assert!((seen.data()[p] - value(p)).abs() < 0.06, "{} {}", seen.data()[p], value(p));
         }
+    }
+
+    /// A ball of radius 1 in front of a camera: the nearest place is at distance − 1 and faces the camera; outlines become those of a mask.
+    #[test]
+    fn shape_is_that_of_the_surface() {
+        let (pictures, camera) = (pictures(0.0), camera(33));
+        let sight = Sight::new(pictures.surface(), &camera);
+        let (depth, normals) = (sight.depth(&camera), sight.normals());
+        let eye = camera.pose.centre();
+        assert!((depth.pixel(16, 16)[0] - (eye.length() - 1.0)).abs() < 0.02, "{}", depth.pixel(16, 16)[0]);
+        assert!(Vec3::from_slice(normals.pixel(16, 16)).dot(eye.normalize()) > 0.99);
+        assert_eq!((depth.pixel(0, 0), normals.pixel(0, 0)), (&[0.0f32][..], &[0.0f32; 3][..]));
+        let half = Mask::from_channel(&Image::filled(33, 33, 1, 0.5), 0).unwrap();
+        let one = sight.over_mask(Image::filled(33, 33, 3, 1.0), Some(&half));
+        assert_eq!((one.pixel(16, 16)[0], one.pixel(0, 0)[0]), (0.5, 0.0));
     }
 }

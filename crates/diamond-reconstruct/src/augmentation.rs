@@ -1,4 +1,5 @@
 //! Pictures that nobody took, in a run: who makes them, of what, and which comes next.
+use crate::guided::{Guidance, GuidedSource};
 use crate::medium_fit::{prior_of, surface_and_medium};
 use crate::pairs::PairOrder;
 use crate::random::Purpose;
@@ -19,6 +20,8 @@ const MADE_BY: &str = "made_pictures";
 pub(crate) struct MadePictures {
     /// Sources beside the prior, in the order in which they are asked.
     pub sources: Vec<Box<dyn Source>>,
+    /// Makes the source that corrects the prior, or works on its surface.
+    pub relighter: Option<Box<dyn GuidedSource>>,
     /// Where pictures are kept.
     pub folder: Option<PathBuf>,
     prior: PriorState,
@@ -63,7 +66,8 @@ impl MadePictures {
     /// Whether anybody makes pictures.
     pub fn wanted(&self, config: &Config) -> bool {
         let settings = &config.augmentation;
-        settings.off_because().is_none() && (settings.asks_prior(config.subsurface.model) || !self.sources.is_empty())
+        settings.off_because().is_none()
+            && (settings.asks_prior(config.subsurface.model) || settings.asks_relighter() || !self.sources.is_empty())
     }
 
     /// Whether pictures have been made.
@@ -110,6 +114,29 @@ impl MadePictures {
             ));
             all.extend(made.frames);
         }
+        if settings.asks_relighter() && !lack.targets.is_empty() {
+            let prior = self.prior(model, capture, &mut notes)?;
+            let relighter = self.relighter.as_ref().ok_or_else(|| ReconstructError::Unusable {
+                detail:
+                    "augmentation.source asks for a relighter, and there is none: see `Reconstruction::with_relighter`"
+                        .into(),
+            })?;
+            if let Some(prior) = prior {
+                let both = settings.source == AugmentationSource::Both;
+                let guidance = Guidance {
+                    surface: prior.surface(),
+                    medium: both.then(|| prior.medium()),
+                    falloff: model.scene.falloff(&model.config),
+                    half_error: settings.half_error,
+                    state: &prior.state(),
+                };
+                let unusable = |source| failure(AugmentError::Source { method: "relighter".into(), source });
+                let mut source = relighter.source(guidance).map_err(unusable)?;
+                let made = generate(capture, &lack.targets, source.as_mut(), &options, progress).map_err(failure)?;
+                notes.push(describe(&made, &source.method(), ""));
+                all.extend(made.frames);
+            }
+        }
         for source in &mut self.sources {
             let made = generate(capture, &lack.targets, source.as_mut(), &options, progress).map_err(failure)?;
             notes.push(describe(&made, &source.method(), ""));
@@ -133,7 +160,9 @@ impl MadePictures {
         if let PriorState::Open = self.prior {
             let fitted = match &model.medium {
                 Some(term) => Ok((term.surface().clone(), term.medium().clone())),
-                None if model.config.augmentation.source == AugmentationSource::Prior => {
+                None if model.config.augmentation.source == AugmentationSource::Prior
+                    || model.config.augmentation.asks_relighter() =>
+                {
                     surface_and_medium(model, capture)
                 }
                 None => {

@@ -15,6 +15,10 @@ pub enum AugmentationSource {
     None,
     /// The physical prior: a medium fitted to the photographs, in the surface of the model as it stands. With a medium in the model it is that one.
     Prior,
+    /// A relighter that diffuses what shading leaves out, from each view's own photographs and the surface's shape.
+    Diffusion,
+    /// A relighter that corrects the pictures of the physical prior.
+    Both,
 }
 
 /// Pictures that nobody took: how many, what they count, and when.
@@ -70,9 +74,14 @@ impl AugmentationSettings {
     pub(crate) fn asks_prior(&self, model: SubsurfaceModel) -> bool {
         match self.source {
             AugmentationSource::Auto => model.has_medium(),
-            AugmentationSource::None => false,
             AugmentationSource::Prior => true,
+            AugmentationSource::None | AugmentationSource::Diffusion | AugmentationSource::Both => false,
         }
+    }
+
+    /// Whether a relighter is asked: one that [`crate::Reconstruction::with_relighter`] brings.
+    pub fn asks_relighter(&self) -> bool {
+        matches!(self.source, AugmentationSource::Diffusion | AugmentationSource::Both)
     }
 
     /// What else keeps pictures from being of use.

@@ -190,12 +190,14 @@ fn made_pictures(config: &Config, facts: &CaptureFacts) -> Decision {
             facts.views * facts.rig_lights
         ),
     };
-    let asks = settings.asks_prior(config.subsurface.model);
+    let asks = settings.asks_prior(config.subsurface.model) || settings.asks_relighter();
     let why = match settings.source {
         AugmentationSource::Auto if asks => "augmentation.source = \"auto\" and the model has a medium",
         AugmentationSource::Auto => "augmentation.source = \"auto\" and the model has no medium",
         AugmentationSource::None => "augmentation.source = \"none\"",
         AugmentationSource::Prior => "augmentation.source = \"prior\"",
+        AugmentationSource::Diffusion => "augmentation.source = \"diffusion\"",
+        AugmentationSource::Both => "augmentation.source = \"both\"",
     };
     let lacking = facts.missing_pairs > 0 || settings.beyond_rig || settings.views > 0;
     match settings.off_because() {

@@ -1,6 +1,7 @@
 //! The run: which pair comes next, when to checkpoint, how to resume.
 use crate::augmentation::{MadePicture, MadePictures};
 use crate::exposure;
+use crate::guided::GuidedSource;
 use crate::pairs::PairOrder;
 use crate::photometric;
 use crate::random::{Purpose, Random};
@@ -235,6 +236,12 @@ impl Reconstruction {
     /// again after [`Reconstruction::resume`]. How many are made and what they count says `[augmentation]`.
     pub fn with_source(mut self, source: Box<dyn Source>) -> Self {
         self.made.sources.push(source);
+        self
+    }
+
+    /// With what makes the relighter that `augmentation.source = "diffusion"` and `"both"` ask for; to be told as [`Reconstruction::with_source`].
+    pub fn with_relighter(mut self, relighter: Box<dyn GuidedSource>) -> Self {
+        self.made.relighter = Some(relighter);
         self
     }
 

@@ -53,7 +53,9 @@ fn run(command: Command) -> Result<(), SssError> {
         Command::Synth { recipe, changes, output, members, contact_sheet, mesh, shards } => {
             synth::run(&synth::Wish { recipe, changes, output, members, contact_sheet, mesh, shards })
         }
-        Command::Shards { captures, output, shard_size } => synth::shards(&captures, &output, shard_size.0),
+        Command::Shards { captures, output, shard_size, prior } => {
+            synth::shards(&captures, &output, shard_size.0, prior)
+        }
         Command::Evaluate { dir, capture, save_images, instruction_set } => {
             choose_instructions(instruction_set)?;
             let mut counter = Counter::new("evaluating");
@@ -114,8 +116,21 @@ fn run(command: Command) -> Result<(), SssError> {
             Ok(())
         }
         Command::Models(command) => models(command),
-        Command::Train { shards, output, steps, batch, size, rate, seed, save_every, held_out, resume } => {
-            let wish = diamond_sss::TrainOptions { steps, batch, size, rate, seed, save_every, held_out, resume };
+        Command::Train {
+            shards,
+            output,
+            steps,
+            batch,
+            size,
+            rate,
+            seed,
+            save_every,
+            held_out,
+            test_shards,
+            resume,
+        } => {
+            let wish =
+                diamond_sss::TrainOptions { steps, batch, size, rate, seed, save_every, held_out, test_shards, resume };
             let mut counter = Counter::new("training");
             let text = diamond_sss::train_on_shards(&shards, &output, &wish, &mut |done, all| counter.show(done, all))?;
             counter.finish();

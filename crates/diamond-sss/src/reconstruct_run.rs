@@ -1,4 +1,5 @@
 //! A whole run: from a capture to model, figures and report, with checkpoints on the way.
+use crate::ShippedRelighter;
 use crate::capture_check::{check_images, open_capture};
 use crate::evaluation::evaluate_with;
 use crate::output_file::write_json;
@@ -302,6 +303,9 @@ fn run(
         }
         Reconstruction::new(capture.clone(), &config)?
     };
+    if config.augmentation.asks_relighter() {
+        training = training.with_relighter(Box::new(ShippedRelighter::default()));
+    }
     training.keep_pictures_in(&folder.join(MADE_PICTURES));
     if let Some(device) = device {
         let name = device.adapter().name.clone();

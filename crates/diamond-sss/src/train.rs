@@ -3,10 +3,10 @@ use crate::SssError;
 use diamond_diffusion::DiffusionError;
 use diamond_diffusion::relight::{RelightTraining, RelighterConfig, train_relighter};
 use diamond_diffusion::train::TrainSettings;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What can be chosen.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TrainOptions {
     /// Steps.
     pub steps: u64,
@@ -20,8 +20,10 @@ pub struct TrainOptions {
     pub seed: u64,
     /// Steps between checkpoints.
     pub save_every: u64,
-    /// Examples that the result is measured on.
+    /// Examples that the result is measured on…
     pub held_out: usize,
+    /// …of these shards, or else of the split `test`.
+    pub test_shards: Option<PathBuf>,
     /// Whether to go on from a checkpoint.
     pub resume: bool,
 }
@@ -40,12 +42,13 @@ pub fn train_on_shards(
         DiffusionError::Setting { .. } => SssError::Usage(error.to_string()),
         other => SssError::Internal(other.to_string()),
     };
-    let TrainOptions { steps, batch, size, rate, seed, save_every, held_out, resume } = *options;
-    let config = RelighterConfig { size, ..RelighterConfig::tiny() };
+    let TrainOptions { steps, batch, size, rate, seed, save_every, held_out, resume, .. } = *options;
+    let config = RelighterConfig { size, ..RelighterConfig::shipped() };
     config.validate().map_err(wrong)?;
     let warm_up = (steps / 20).min(100);
     let settings = TrainSettings { seed, steps, warm_up, rate, ..TrainSettings::default() };
-    let training = RelightTraining { config, settings, batch, save_every, held_out };
+    let training =
+        RelightTraining { config, settings, batch, save_every, held_out, test_shards: options.test_shards.clone() };
     let mut last = f64::NAN;
     let (model, measured) = train_relighter(shards, output, &training, resume, &mut |report| {
         last = report.loss;
@@ -53,10 +56,7 @@ pub fn train_on_shards(
     })
     .map_err(wrong)?;
     let figures = match measured {
-        Some(m) => format!(
-            "held out, {} examples, PSNR where the object is: relit {:.2} dB, source as it is {:.2} dB\n",
-            m.examples, m.relit, m.copied
-        ),
+        Some(measured) => format!("held out, {measured}"),
         None => "not measured: the shards have no split `test`, or no examples were asked for\n".into(),
     };
     Ok(format!("{figures}written: {} (last loss {last:.4})\n", model.display()))

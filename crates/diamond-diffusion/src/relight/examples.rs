@@ -1,5 +1,8 @@
 //! Training examples from shards of captures: views under many lights, at the size of the network.
+use super::base::{Base, Prediction, RelightTarget};
 use super::hints::{RelightView, hint_planes};
+use super::orientation::Orientation;
+use super::predictions::{PredictedView, read_predictions};
 use super::ratio::encode_ratio;
 use crate::error::{DiffusionError, Result};
 use crate::light_code::light_code;
@@ -13,10 +16,32 @@ use glam::{Mat3, Vec3};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// A view under one light, and its picture under another.
+#[derive(Debug, Clone)]
+pub struct RelightExample {
+    /// The view, with its source picture.
+    pub view: RelightView,
+    /// The other light, and what is predicted for it.
+    pub target: RelightTarget,
+    /// The picture under it: linear, divided by the light's intensity.
+    pub picture: Image,
+}
+
+/// What an example tells the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Told {
+    /// For training: anything of the following by chance, or not even the source's light; in any of eight orientations, with exchanged colours and another exposure.
+    Anything,
+    /// Shape, the estimated one where there is one, and both lights.
+    Shape,
+    /// What a physical model predicts, besides.
+    Medium,
+}
+
 /// A batch to train on; pictures have (batch, channels, height, width).
 #[derive(Debug, Clone)]
 pub struct RelightBatch {
-    /// Logarithms of ratios of target to source, 3 channels.
+    /// Logarithms of ratios of targets to what is predicted of them, 3 channels.
     pub ratios: Tensor,
     /// What the ControlNet is shown.
     pub hints: Tensor,
@@ -25,23 +50,24 @@ pub struct RelightBatch {
 }
 
 impl RelightBatch {
-    /// Of views with their target pictures (linear, divided by the light's intensity) and target lights; all of one size.
-    pub fn new(examples: &[(&RelightView, &Image, Vec3)]) -> Result<Self> {
-        let Some((first, ..)) = examples.first() else {
+    /// Of examples of one size.
+    pub fn new(examples: &[RelightExample]) -> Result<Self> {
+        let Some(first) = examples.first() else {
             return Err(DiffusionError::setting("batch", "at least one example", "none"));
         };
-        let (width, height, _) = first.source.shape();
+        let (width, height, _) = first.view.source.shape();
         let (mut ratios, mut hints, mut lights) = (Vec::new(), Vec::new(), Vec::new());
-        for (view, target, light) in examples {
-            if view.source.shape() != (width, height, 3) || target.shape() != (width, height, 3) {
-                return Err(DiffusionError::shape("pictures of a batch", (width, height, 3), target.shape()));
+        for RelightExample { view, target, picture } in examples {
+            if view.source.shape() != (width, height, 3) || picture.shape() != (width, height, 3) {
+                return Err(DiffusionError::shape("pictures of a batch", (width, height, 3), picture.shape()));
             }
-            hints.extend(hint_planes(view, *light)?);
+            let base = Base::of(view, target)?;
+            hints.extend(hint_planes(view, target.light, &base)?);
             for c in 0..3 {
-                let pairs = view.source.data().iter().zip(target.data()).skip(c).step_by(3);
-                ratios.extend(pairs.map(|(source, target)| encode_ratio(*source, *target)));
+                let pairs = base.prediction.target.data().iter().zip(picture.data()).skip(c).step_by(3);
+                ratios.extend(pairs.map(|(predicted, picture)| encode_ratio(*predicted, *picture)));
             }
-            lights.extend(view_light_code(view, *light)?);
+            lights.extend(view_light_code(view, target.light)?);
         }
         let (batch, device) = (examples.len(), &Device::Cpu);
         Ok(Self {
@@ -63,6 +89,8 @@ pub(super) fn view_light_code(view: &RelightView, light: Vec3) -> Result<[f32; L
 struct Stored {
     view: RelightView,
     pictures: Vec<(Image, Vec3)>,
+    /// As a physical model has it, pictures in the same order.
+    predicted: Option<PredictedView>,
 }
 
 /// Views of shards, in memory at one size.
@@ -71,7 +99,7 @@ pub struct RelightExamples {
     views: Vec<Stored>,
 }
 
-fn wrong(path: &Path, problem: impl Into<String>) -> DiffusionError {
+pub(super) fn wrong(path: &Path, problem: impl Into<String>) -> DiffusionError {
     DiffusionError::File { path: path.display().to_string(), problem: problem.into() }
 }
 
@@ -109,31 +137,119 @@ impl RelightExamples {
         self.views.is_empty()
     }
 
-    /// Example `index` of a fixed order that depends on `seed` alone: the view with its source picture, the target and its light.
-    pub fn example(&self, seed: u64, index: u64) -> (RelightView, &Image, Vec3) {
+    /// Whether every view comes with what a physical model predicts of it.
+    pub fn predicted(&self) -> bool {
+        self.views.iter().all(|stored| stored.predicted.is_some())
+    }
+
+    /// Lights of the view of example `index`, and which of them are its source's and its target's: pairs of different lights.
+    fn choice(&self, seed: u64, index: u64) -> (Noise, &Stored, usize, usize) {
         let mut noise = Noise::new(seed, "relighting", index);
         let stored = &self.views[noise.below(self.views.len())];
         let count = stored.pictures.len();
         let source = noise.below(count);
-        // Another light than the source's.
         let target = (source + 1 + noise.below(count - 1)) % count;
-        let mut view = stored.view.clone();
-        view.source = stored.pictures[source].0.clone();
-        // One time in four the network is not told where the source's light is.
-        view.source_light = (noise.below(4) > 0).then_some(stored.pictures[source].1);
-        (view, &stored.pictures[target].0, stored.pictures[target].1)
+        (noise, stored, source, target)
     }
 
-    /// Batch `step` of `count` examples.
+    /// Example `index` of a fixed order that depends on `seed` alone.
+    ///
+    /// # Errors
+    /// [`Told::Medium`] of views of which nothing is predicted.
+    pub fn example(&self, seed: u64, index: u64, told: Told) -> Result<RelightExample> {
+        let (mut noise, stored, source, target) = self.choice(seed, index);
+        let (mut view, light) = (stored.view.clone(), stored.pictures[target].1);
+        view.source = stored.pictures[source].0.clone();
+        view.source_light = Some(stored.pictures[source].1);
+        let draw = noise.uniform();
+        let predicted = stored.predicted.as_ref().filter(|_| told != Told::Anything || draw >= TRUE_SHAPE);
+        if let Some(predicted) = predicted {
+            (view.depth, view.normals) = (predicted.depth.clone(), predicted.normals.clone());
+        }
+        let prediction = predicted.filter(|_| match told {
+            Told::Anything => draw >= TRUE_SHAPE + ESTIMATED_SHAPE,
+            Told::Shape => false,
+            Told::Medium => true,
+        });
+        let prediction =
+            prediction.map(|p| Prediction { source: p.pictures[source].clone(), target: p.pictures[target].clone() });
+        if told == Told::Medium && prediction.is_none() {
+            let expected = "files of predictions beside the shards";
+            return Err(DiffusionError::setting("what a physical model predicts", expected, "none"));
+        }
+        let example = RelightExample {
+            view,
+            target: RelightTarget { light, prediction },
+            picture: stored.pictures[target].0.clone(),
+        };
+        Ok(if told == Told::Anything { varied(example, &mut noise) } else { example })
+    }
+
+    /// The other pictures of the view of example `index`, and where their lights are: without its source and its target.
+    pub fn others(&self, seed: u64, index: u64) -> Vec<(&Image, Vec3)> {
+        let (_, stored, source, target) = self.choice(seed, index);
+        let pictures = stored.pictures.iter().enumerate().filter(|(i, _)| *i != source && *i != target);
+        pictures.map(|(_, (image, light))| (image, *light)).collect()
+    }
+
+    /// Batch `step` of `count` examples for training.
     pub fn batch(&self, seed: u64, step: u64, count: usize) -> Result<RelightBatch> {
-        let examples: Vec<_> = (0..count as u64).map(|i| self.example(seed, step * count as u64 + i)).collect();
-        let borrowed: Vec<_> = examples.iter().map(|(view, target, light)| (view, *target, *light)).collect();
-        RelightBatch::new(&borrowed)
+        let examples = (0..count as u64).map(|i| self.example(seed, step * count as u64 + i, Told::Anything));
+        RelightBatch::new(&examples.collect::<Result<Vec<_>>>()?)
     }
 }
 
+/// Share of training examples that have the true shape, where an estimated one is known…
+const TRUE_SHAPE: f32 = 0.15;
+/// …and of those that have the estimated one, but nothing that a medium predicts.
+const ESTIMATED_SHAPE: f32 = 0.35;
+/// One in so many examples without a prediction is not told where the source's light is.
+const UNKNOWN_LIGHT: usize = 12;
+/// Exposures by which training examples are multiplied.
+const EXPOSURES: [f32; 2] = [0.6, 1.5];
+
+/// An example as it might as well have been: turned or mirrored, with exchanged colours, which do not know of each other, and another exposure.
+fn varied(example: RelightExample, noise: &mut Noise) -> RelightExample {
+    let orientation = Orientation::new(noise.below(8));
+    let (first, odd) = (noise.below(3), noise.below(2));
+    let colours = [first, (first + 1 + odd) % 3, (first + 2 - odd) % 3];
+    let exposure = EXPOSURES[0] + (EXPOSURES[1] - EXPOSURES[0]) * noise.uniform();
+    let radiance = |image: &Image| {
+        let mut out = orientation.image(image);
+        for pixel in out.data_mut().chunks_exact_mut(3) {
+            let old = [pixel[0], pixel[1], pixel[2]];
+            pixel.iter_mut().zip(colours).for_each(|(to, c)| *to = exposure * old[c]);
+        }
+        out
+    };
+    let mut view = orientation.view(&example.view);
+    view.source = radiance(&example.view.source);
+    let prediction = example.target.prediction;
+    if prediction.is_none() && noise.below(UNKNOWN_LIGHT) == 0 {
+        view.source_light = None;
+    }
+    RelightExample {
+        view,
+        target: RelightTarget {
+            light: orientation.place(example.target.light),
+            prediction: prediction.map(|p| Prediction { source: radiance(&p.source), target: radiance(&p.target) }),
+        },
+        picture: radiance(&example.picture),
+    }
+}
+
+/// A picture of some of a tensor's values.
+pub(super) fn image_of(path: &Path, (width, height, channels): (usize, usize, usize), values: &[f32]) -> Result<Image> {
+    Image::from_vec(width, height, channels, values.to_vec()).map_err(|e| wrong(path, e.to_string()))
+}
+
 /// Values and shape of one tensor of a shard.
-fn take(tensors: &BTreeMap<String, Tensor>, path: &Path, name: &str, rank: usize) -> Result<(Vec<f32>, Vec<usize>)> {
+pub(super) fn take(
+    tensors: &BTreeMap<String, Tensor>,
+    path: &Path,
+    name: &str,
+    rank: usize,
+) -> Result<(Vec<f32>, Vec<usize>)> {
     let tensor = tensors.get(name).ok_or_else(|| wrong(path, format!("no tensor {name}: not a shard")))?;
     if tensor.rank() != rank {
         return Err(wrong(path, format!("{name}: expected {rank} dimensions, found {:?}", tensor.dims())));
@@ -163,11 +279,11 @@ fn read_shard(path: &Path, size: usize) -> Result<Vec<Stored>> {
     let poses = sized("world_to_camera", 3, vec![views, 3, 4])?;
     let positions = sized("light_positions", 3, vec![views, lights, 3])?;
     let intensities = sized("light_intensities", 3, vec![views, lights, 3])?;
-    let picture = |channels: usize, values: &[f32]| {
-        Image::from_vec(width, height, channels, values.to_vec()).map_err(|e| wrong(path, e.to_string()))
-    };
+    let picture = |channels: usize, values: &[f32]| image_of(path, (width, height, channels), values);
+    let mut predicted = read_predictions(path, &[views, lights, height, width])?.map(Vec::into_iter);
     let mut stored = Vec::new();
     for v in 0..views {
+        let mut predicted = predicted.as_mut().and_then(Iterator::next);
         let k = &intrinsics[v * 4..][..4];
         let intrinsics =
             Intrinsics { fx: k[0], fy: k[1], cx: k[2], cy: k[3], width: width as u32, height: height as u32 };
@@ -185,7 +301,7 @@ fn read_shard(path: &Path, size: usize) -> Result<Vec<Stored>> {
             normals: picture(3, &normals[v * pixels * 3..][..pixels * 3])?,
             source_light: None,
         };
-        let mut pictures = Vec::new();
+        let (mut pictures, mut predictions) = (Vec::new(), Vec::new());
         for l in 0..lights {
             let at = v * lights + l;
             let position = Vec3::from_slice(&positions[at * 3..][..3]);
@@ -193,14 +309,26 @@ fn read_shard(path: &Path, size: usize) -> Result<Vec<Stored>> {
             if !(intensity.min_element() > 0.0) {
                 continue;
             }
-            let mut image = picture(3, &images[at * pixels * 3..][..pixels * 3])?;
-            for (i, value) in image.data_mut().iter_mut().enumerate() {
-                *value = value.max(0.0) / intensity[i % 3];
+            let normalized = |image: Image| {
+                let mut image = image;
+                for (i, value) in image.data_mut().iter_mut().enumerate() {
+                    *value = value.max(0.0) / intensity[i % 3];
+                }
+                image.resize_area(size, size).map_err(|e| wrong(path, e.to_string()))
+            };
+            pictures.push((normalized(picture(3, &images[at * pixels * 3..][..pixels * 3])?)?, position));
+            if let Some(predicted) = &mut predicted {
+                predictions.push(normalized(predicted.pictures[l].clone())?);
             }
-            let image = image.resize_area(size, size).map_err(|e| wrong(path, e.to_string()))?;
-            pictures.push((image, position));
         }
-        stored.push(Stored { view: view.resized(size, size)?, pictures });
+        let predicted = match predicted {
+            Some(PredictedView { depth, normals, .. }) => {
+                let small = RelightView { depth, normals, ..view.clone() }.resized(size, size)?;
+                Some(PredictedView { depth: small.depth, normals: small.normals, pictures: predictions })
+            }
+            None => None,
+        };
+        stored.push(Stored { view: view.resized(size, size)?, pictures, predicted });
     }
     Ok(stored)
 }

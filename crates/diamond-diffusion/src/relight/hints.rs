@@ -1,12 +1,14 @@
 //! What a ControlNet is shown: the source picture, its shape, and what lights do to that shape.
+use super::base::Base;
+use super::ratio::encode_ratio;
 use crate::error::{DiffusionError, Result};
 use diamond_camera::{Camera, Depth};
 use diamond_image::{Image, Transfer};
 use glam::{Vec2, Vec3};
 
-/// Number of hint planes: source colours 3, coverage, depth, normals 3, n·l of the target, n·l of the source, highlight of the target,
-/// direction to the target light 3.
-pub const HINTS: usize = 14;
+/// Number of hint planes: source colours 3, coverage, depth, normals 3, n·l of the target and of the source, highlights of the target and of the source,
+/// direction to the target light 3, colours of the target as predicted 3, ratio of the source to its prediction 3, whether a physical model predicted.
+pub const HINTS: usize = 22;
 
 /// Exponent of the highlight's cosine: about the lobe of a roughness of 0.5.
 const HIGHLIGHT: i32 = 32;
@@ -58,7 +60,7 @@ impl RelightView {
     }
 
     /// A surface point, where there is one.
-    fn point(&self, x: usize, y: usize) -> Option<Vec3> {
+    pub(super) fn point(&self, x: usize, y: usize) -> Option<Vec3> {
         let z = self.depth.pixel(x, y)[0];
         (z > 0.0).then(|| self.camera.unproject(Vec2::new(x as f32 + 0.5, y as f32 + 0.5), Depth::Z(z)))
     }
@@ -102,38 +104,56 @@ impl RelightView {
     }
 }
 
-/// The [`HINTS`] planes of a view under a target light at a position in the world, one after the other, about in [−1, 1].
-pub fn hint_planes(view: &RelightView, target_light: Vec3) -> Result<Vec<f32>> {
+/// The [`HINTS`] planes of a view under a target light at a position in the world, one after the other, about in [−1, 1]. What `base` predicts has the
+/// view's size, see [`Base::of`].
+pub fn hint_planes(view: &RelightView, target_light: Vec3, base: &Base) -> Result<Vec<f32>> {
     view.validate()?;
     if !target_light.is_finite() {
         return Err(DiffusionError::setting("target light", "a finite position", target_light));
+    }
+    let predicted = &base.prediction;
+    for image in [&predicted.source, &predicted.target] {
+        if image.shape() != view.source.shape() {
+            return Err(DiffusionError::shape("prediction", view.source.shape(), image.shape()));
+        }
     }
     let (width, height, _) = view.source.shape();
     let pixels = width * height;
     let mut planes = vec![0.0; HINTS * pixels];
     let shape = view.centre_and_radius();
     let eye = view.camera.pose.centre();
+    let display = |radiance: f32| 2.0 * Transfer::Srgb.encode(radiance.clamp(0.0, 1.0)) - 1.0;
     for p in 0..pixels {
         let (x, y) = (p % width, p / width);
         let mut hints = [0.0; HINTS];
-        for (hint, radiance) in hints.iter_mut().zip(view.source.pixel(x, y)) {
-            *hint = 2.0 * Transfer::Srgb.encode(radiance.clamp(0.0, 1.0)) - 1.0;
+        for c in 0..3 {
+            let [source, base_source, base_target] =
+                [&view.source, &predicted.source, &predicted.target].map(|image| image.data()[3 * p + c]);
+            hints[c] = display(source);
+            hints[15 + c] = display(base_target);
+            hints[18 + c] = encode_ratio(base_source, source);
         }
         hints[3] = view.coverage.pixel(x, y)[0];
+        hints[21] = f32::from(u8::from(base.physical));
         if let (Some((centre, radius)), Some(point)) = (shape, view.point(x, y)) {
             let normal = Vec3::from_slice(view.normals.pixel(x, y));
             let depth_of = |p: Vec3| view.camera.pose.transform_point(p).z;
             hints[4] = ((depth_of(point) - depth_of(centre)) / radius).clamp(-1.0, 1.0);
             let in_view = |v: Vec3| to_viewer(view.camera.pose.rotation * v);
             hints[5..8].copy_from_slice(&in_view(normal).to_array());
-            let to_light = (target_light - point).normalize_or_zero();
-            hints[8] = normal.dot(to_light).max(0.0);
+            let to_eye = (eye - point).normalize_or_zero();
+            // Cosine and highlight of a light.
+            let lit = |light: Vec3| {
+                let to_light = (light - point).normalize_or_zero();
+                let half = (to_light + to_eye).normalize_or_zero();
+                (to_light, normal.dot(to_light), normal.dot(half).max(0.0).powi(HIGHLIGHT))
+            };
+            let to_light;
+            (to_light, hints[8], hints[10]) = lit(target_light);
             if let Some(light) = view.source_light {
-                hints[9] = normal.dot((light - point).normalize_or_zero()).max(0.0);
+                (_, hints[9], hints[11]) = lit(light);
             }
-            let half = (to_light + (eye - point).normalize_or_zero()).normalize_or_zero();
-            hints[10] = normal.dot(half).max(0.0).powi(HIGHLIGHT);
-            hints[11..14].copy_from_slice(&in_view(to_light).to_array());
+            hints[12..15].copy_from_slice(&in_view(to_light).to_array());
         }
         for (c, hint) in hints.into_iter().enumerate() {
             planes[c * pixels + p] = hint;

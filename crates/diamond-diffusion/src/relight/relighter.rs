@@ -1,4 +1,5 @@
 //! The network of the relighter, what it is trained for, and its use.
+use super::base::{Base, RelightTarget};
 use super::examples::{RelightBatch, view_light_code};
 use super::hints::{HINTS, RelightView, hint_planes};
 use super::ratio::decode_ratio;
@@ -10,10 +11,9 @@ use crate::parameterization::Parameterization;
 use crate::sampler::{Sampler, Spacing, shared_noise};
 use crate::schedule::Schedule;
 use crate::train::{ImageTerms, Objective};
-use crate::unet::{Conditions, ControlConfig, ControlNet, LIGHT_CHANNELS, UNet};
+use crate::unet::{Conditions, ControlConfig, ControlNet, LIGHT_CHANNELS, UNet, UNetConfig};
 use candle_core::{Device, Tensor};
 use diamond_image::Image;
-use glam::Vec3;
 
 /// Pixels of a side that become one place with more channels.
 const BLOCK: usize = 2;
@@ -32,6 +32,18 @@ impl RelighterConfig {
     /// The small one, at 64 × 64 pixels.
     pub fn tiny() -> Self {
         Self { networks: ControlConfig::tiny_relighter(HINTS), size: 64 }
+    }
+
+    /// That of `assets/models`, which trains in an hour on one core: 48 × 48 pixels, a few hundred thousand weights.
+    pub fn shipped() -> Self {
+        let unet = UNetConfig {
+            channels: vec![32, 48, 64],
+            attention: vec![false, false, true],
+            heads: vec![2, 3, 4],
+            context: Some(32),
+            ..UNetConfig::tiny_relighter()
+        };
+        Self { networks: ControlConfig { unet, hints: HINTS, hint_channels: vec![16, 32] }, size: 48 }
     }
 
     /// Whether the numbers fit together.
@@ -87,6 +99,10 @@ pub struct Relighter {
     unet: UNet,
     control: ControlNet,
     objective: Objective,
+    /// On held-out objects, from the shape alone and with a fitted medium; see [`Relighter::expected_error`].
+    pub(super) errors: [Option<f32>; 2],
+    /// See [`Relighter::digest`].
+    pub(super) digest: u64,
 }
 
 impl Relighter {
@@ -97,13 +113,18 @@ impl Relighter {
             schedule: Schedule::stable_diffusion().with_zero_terminal_snr(),
             parameterization: Parameterization::V,
             min_snr: Some(5.0),
-            image: ImageTerms::default(),
+            // Of ratios, which are no pictures: structure is not asked for.
+            image: ImageTerms { ssim: 0.0, ..ImageTerms::default() },
+            // Sampling begins there, and with few steps most is decided there.
+            noise_only: 0.3,
         };
         Ok(Self {
             unet: UNet::new(&scope.at("unet"), &config.networks.unet)?,
             control: ControlNet::new(&scope.at("control"), &config.networks)?,
             config: config.clone(),
             objective,
+            errors: [None; 2],
+            digest: 0,
         })
     }
 
@@ -128,21 +149,28 @@ impl Relighter {
         })
     }
 
-    /// The view under lights at other positions, one picture each. A view of any size goes in and comes out: the network works at its own
-    /// size, and its ratios are enlarged and applied to the source picture.
-    pub fn relight(&self, view: &RelightView, lights: &[Vec3], options: &RelightOptions) -> Result<Vec<Relit>> {
+    /// The view under other lights, one picture each. A view of any size goes in and comes out: the network works at its own
+    /// size, and its ratios are enlarged and applied to what is predicted at the view's.
+    pub fn relight(
+        &self,
+        view: &RelightView,
+        targets: &[RelightTarget],
+        options: &RelightOptions,
+    ) -> Result<Vec<Relit>> {
         view.validate()?;
-        if options.runs == 0 || lights.is_empty() {
+        if options.runs == 0 || targets.is_empty() {
             return Err(DiffusionError::setting("runs and lights", "at least one of each", "none"));
         }
         let size = self.config.size;
         let small = view.resized(size, size)?;
-        let (mut hints, mut codes) = (Vec::new(), Vec::new());
-        for light in lights {
-            hints.extend(hint_planes(&small, *light)?);
-            codes.extend(view_light_code(&small, *light)?);
+        let (mut hints, mut codes, mut bases) = (Vec::new(), Vec::new(), Vec::new());
+        for target in targets {
+            let base = Base::of(view, target)?;
+            hints.extend(hint_planes(&small, target.light, &base.resized(size, size)?)?);
+            codes.extend(view_light_code(&small, target.light)?);
+            bases.push(base.prediction.target);
         }
-        let (batch, device) = (lights.len(), &Device::Cpu);
+        let (batch, device) = (targets.len(), &Device::Cpu);
         let hints = Tensor::from_vec(hints, (batch, HINTS, size, size), device)?;
         let codes = Tensor::from_vec(codes, (batch, LIGHT_CHANNELS), device)?;
         let sampler = Sampler::ddim(&self.objective.schedule, options.steps, Spacing::Trailing, Parameterization::V)?;
@@ -157,18 +185,19 @@ impl Relighter {
             runs.push(ratios.permute((0, 2, 3, 1))?.contiguous()?.flatten_all()?.to_vec1::<f32>()?);
         }
         let values = width * height * 3;
-        (0..batch).map(|i| relit(&view.source, runs.iter().map(|run| &run[i * values..][..values]).collect())).collect()
+        let of = |i: usize| runs.iter().map(|run| &run[i * values..][..values]).collect();
+        bases.iter().enumerate().map(|(i, base)| relit(base, of(i))).collect()
     }
 }
 
 /// Mean and deviation of the radiances that several runs' ratios give.
-fn relit(source: &Image, runs: Vec<&[f32]>) -> Result<Relit> {
-    let (width, height, _) = source.shape();
+fn relit(base: &Image, runs: Vec<&[f32]>) -> Result<Relit> {
+    let (width, height, _) = base.shape();
     let count = runs.len() as f32;
     let mut image = Image::new(width, height, 3);
     let mut deviation = Image::new(width, height, 1);
-    for (i, (value, source)) in image.data_mut().iter_mut().zip(source.data()).enumerate() {
-        let radiances = runs.iter().map(|run| decode_ratio(*source, run[i]));
+    for (i, (value, base)) in image.data_mut().iter_mut().zip(base.data()).enumerate() {
+        let radiances = runs.iter().map(|run| decode_ratio(*base, run[i]));
         let (sum, squares) = radiances.fold((0.0f32, 0.0f32), |(sum, squares), r| (sum + r, squares + r * r));
         *value = sum / count;
         deviation.data_mut()[i / 3] += ((squares / count - *value * *value).max(0.0)) / 3.0;

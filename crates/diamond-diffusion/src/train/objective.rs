@@ -46,6 +46,8 @@ pub struct Objective {
     pub min_snr: Option<f64>,
     /// Terms on predicted pictures.
     pub image: ImageTerms,
+    /// Share of the pictures that are trained on at the last timestep, where sampling begins; the other timesteps are drawn evenly.
+    pub noise_only: f32,
 }
 
 impl Objective {
@@ -84,7 +86,9 @@ impl Objective {
         let mut noise = Noise::new(seed, "timesteps", step);
         let mut timesteps = Vec::with_capacity(batch);
         while timesteps.len() < batch {
-            let drawn = noise.below(self.schedule.steps());
+            let steps = self.schedule.steps();
+            let drawn =
+                if self.noise_only > 0.0 && noise.uniform() < self.noise_only { steps - 1 } else { noise.below(steps) };
             timesteps.extend(std::iter::repeat_n(drawn, views.max(1).min(batch - timesteps.len())));
         }
         timesteps

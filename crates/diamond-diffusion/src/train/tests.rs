@@ -42,7 +42,7 @@ fn model(seed: u64) -> (Model, Variables) {
 
 fn objective(image: ImageTerms) -> Objective {
     let schedule = Schedule::stable_diffusion().with_zero_terminal_snr();
-    Objective { schedule, parameterization: Parameterization::V, min_snr: Some(5.0), image }
+    Objective { schedule, parameterization: Parameterization::V, min_snr: Some(5.0), image, noise_only: 0.0 }
 }
 
 /// Smooth pictures (2, 3, 8, 8) in [−1, 1], their hints and light codes.

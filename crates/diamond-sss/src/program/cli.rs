@@ -164,6 +164,7 @@ docs/captures.md says what a recipe can say and what is written.")]
     #[command(after_help = "Examples:
   diamond shards candle -o shards
   diamond shards family/* -o shards --shard-size 32MiB
+  diamond shards family/* -o shards --prior
 
 index.json in the folder lists the shards; docs/captures.md has their layout and how to read them in Python.
 Shards that are there are kept, so the same command goes on after an interruption.")]
@@ -177,6 +178,9 @@ Shards that are there are kept, so the same command goes on after an interruptio
         /// Size of a shard at most; a view with all its lights is not cut
         #[arg(long, value_name = "SIZE", default_value = "64MiB")]
         shard_size: ByteSize,
+        /// Also fit a medium to each capture, to each training view under one light, and write what it predicts of them all beside their shards
+        #[arg(long)]
+        prior: bool,
     },
     /// Files of network weights (safetensors): what they are, whether they fit, and into our names
     #[command(
@@ -191,12 +195,12 @@ No weights are contained or fetched: they are files that you have, under their o
     Models(ModelsCommand),
     /// Train the relighter on shards: what a view looks like under lights that it was not photographed under
     #[command(after_help = "Examples:
-  diamond shards family/* -o shards
-  diamond train shards -o relighter --steps 5000
+  diamond shards family/* -o shards --prior
+  diamond shards others/* -o test-shards --prior
+  diamond train shards -o relighter --steps 5000 --test-shards test-shards
   diamond train shards -o relighter --steps 5000 --resume
 
-The folder gets checkpoint.safetensors, curve.csv and, at the end, model.safetensors. Runs on the CPU; no other command
-uses the model yet.")]
+The folder gets checkpoint.safetensors, curve.csv and, at the end, model.safetensors. Runs on the CPU.")]
     Train {
         /// Folder of shards, with index.json
         shards: PathBuf,
@@ -210,7 +214,7 @@ uses the model yet.")]
         #[arg(long, default_value_t = 4, value_parser = at_least_one)]
         batch: usize,
         /// Pixels of a side that the network works at, a multiple of 8
-        #[arg(long, default_value_t = 64)]
+        #[arg(long, default_value_t = 48)]
         size: usize,
         /// Largest learning rate
         #[arg(long, default_value_t = 3e-4)]
@@ -221,9 +225,12 @@ uses the model yet.")]
         /// Steps between checkpoints
         #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
         save_every: u64,
-        /// Examples of the shards' split `test` that the result is measured on
-        #[arg(long, default_value_t = 32)]
+        /// Examples that the result is measured on
+        #[arg(long, default_value_t = 60)]
         held_out: usize,
+        /// Shards of other objects, whose training views the result is measured on; without, the shards' own split `test`
+        #[arg(long, value_name = "DIR")]
+        test_shards: Option<PathBuf>,
         /// Go on from the checkpoint, with the same options
         #[arg(long)]
         resume: bool,

@@ -2,7 +2,7 @@
 use super::progress::Counter;
 use super::{complain, print};
 use diamond_dataset::{Capture, OpenOptions};
-use diamond_sss::{SheetOptions, SssError, contact_sheet, family_sheet, write_output};
+use diamond_sss::{SheetOptions, SssError, contact_sheet, export_predictions, family_sheet, write_output};
 use diamond_synth::{CaptureRecord, Family, Object, Progress, Recipe, ShardOptions, Stage, export_shards, synthesize};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -81,19 +81,25 @@ pub fn run(wish: &Wish) -> Result<(), SssError> {
         print(&format!("written: {}\n", path.display()));
     }
     match &wish.shards {
-        Some(output) => shards(&captures, output, ShardOptions::default().bytes),
+        Some(output) => shards(&captures, output, ShardOptions::default().bytes, false),
         None => Ok(()),
     }
 }
 
 /// Writes captures as shards.
-pub fn shards(captures: &[PathBuf], output: &Path, bytes: u64) -> Result<(), SssError> {
+pub fn shards(captures: &[PathBuf], output: &Path, bytes: u64, prior: bool) -> Result<(), SssError> {
     let counter = Mutex::new(Counter::new("shards"));
     let told = |done, all| counter.lock().unwrap_or_else(PoisonError::into_inner).show(done, all);
     let index = export_shards(captures, output, &ShardOptions { bytes }, &told)?;
     counter.lock().unwrap_or_else(PoisonError::into_inner).finish();
     let size = index.shards.iter().map(|s| s.bytes).sum::<u64>() as f64 / 1e6;
     print(&format!("{}: {} shards, {size:.1} MB\n", output.display(), index.shards.len()));
+    if prior {
+        let mut counter = Counter::new("predictions");
+        let left_out = export_predictions(captures, &index, output, &mut |done, all| counter.show(done, all))?;
+        counter.finish();
+        left_out.iter().for_each(|line| print(&format!("{line}\n")));
+    }
     Ok(())
 }
 

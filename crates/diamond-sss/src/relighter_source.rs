@@ -1,0 +1,230 @@
+//! The relighter as a source of pictures that nobody took, and what a fitted medium says to it.
+use diamond_augment::{Picture, Source, SourceError, Target};
+use diamond_camera::Camera;
+use diamond_dataset::Capture;
+use diamond_diffusion::relight::{Prediction, RelightOptions, RelightTarget, RelightView, Relighter, Relit};
+use diamond_image::{Image, Mask, Transfer};
+use diamond_light::{Falloff, OlatLight};
+use diamond_medium::{MediumPictures, Sight, Surface};
+use diamond_reconstruct::{Guidance, GuidedSource};
+use glam::Vec3;
+
+/// The model that the program contains; `assets/models/README.md` says how it was trained.
+const SHIPPED: &[u8] = include_bytes!("../../../assets/models/relighter.safetensors");
+
+/// Error that is assumed of a relighter whose file does not state it: about that of shading, display values.
+const ASSUMED_ERROR: f32 = 0.08;
+
+/// A view of a surface as the relighter wants it: geometry and coverage of a camera.
+#[derive(Debug, Clone)]
+pub struct SurfaceView {
+    sight: Sight,
+    camera: Camera,
+    mask: Option<Mask>,
+}
+
+impl SurfaceView {
+    /// What a camera sees of a surface, within the photographs' silhouette where there is one.
+    pub fn new(surface: &Surface, camera: &Camera, mask: Option<&Mask>) -> Self {
+        Self { sight: Sight::new(surface, camera), camera: *camera, mask: mask.cloned() }
+    }
+
+    /// View-space z and normals, 0 where nothing is.
+    pub fn shape(&self) -> (Image, Image) {
+        (self.sight.depth(&self.camera), self.sight.normals())
+    }
+
+    /// Coverage: the photographs', or the surface's.
+    pub fn coverage(&self) -> Image {
+        let mask = self.mask.as_ref().and_then(|m| Image::from_vec(m.width(), m.height(), 1, m.data().to_vec()).ok());
+        mask.unwrap_or_else(|| self.sight.coverage())
+    }
+
+    /// What the medium predicts under a light.
+    pub fn predicted(&self, pictures: &mut MediumPictures, light: &OlatLight) -> Result<Image, SourceError> {
+        Ok(self.sight.over_mask(pictures.radiance(&self.sight, light)?, self.mask.as_ref()))
+    }
+}
+
+/// Relights photographs of a capture.
+pub struct RelighterSource {
+    relighter: Relighter,
+    options: RelightOptions,
+    surface: Surface,
+    medium: Option<MediumPictures>,
+    falloff: Falloff,
+    half_error: f32,
+    error: f32,
+    state: String,
+}
+
+/// Makes a [`RelighterSource`] of the relighter that the program contains, or of a file's.
+#[derive(Debug, Clone, Default)]
+pub struct ShippedRelighter {
+    /// Another model than the program's own.
+    pub file: Option<std::path::PathBuf>,
+}
+
+impl GuidedSource for ShippedRelighter {
+    fn source(&self, guidance: Guidance<'_>) -> Result<Box<dyn Source>, SourceError> {
+        let relighter = match &self.file {
+            Some(path) => Relighter::load(path)?,
+            None => Relighter::from_bytes(SHIPPED, "the relighter in the program")?,
+        };
+        let medium = match guidance.medium {
+            Some(medium) => Some(MediumPictures::new(guidance.surface.clone(), medium.clone(), guidance.falloff)?),
+            None => None,
+        };
+        let options = RelightOptions::default();
+        let error = relighter.expected_error(medium.is_some()).unwrap_or(ASSUMED_ERROR);
+        let state = format!("{} {options:?} {} {}", relighter.digest(), guidance.state, medium.is_some());
+        Ok(Box::new(RelighterSource {
+            relighter,
+            options,
+            surface: guidance.surface.clone(),
+            medium,
+            falloff: guidance.falloff,
+            half_error: guidance.half_error,
+            error,
+            state,
+        }))
+    }
+}
+
+/// Irradiance of a light at a point, for directions too.
+fn irradiance(light: &OlatLight, at: Vec3, falloff: Falloff) -> Vec3 {
+    light.incidence(at, falloff).irradiance
+}
+
+/// Where a light stands; one that is infinitely far stands in its direction, so far that it does not matter.
+fn place(light: &OlatLight, centre: Vec3, distance: f32) -> Vec3 {
+    match *light {
+        OlatLight::Point { position, .. } => position,
+        OlatLight::Directional { direction, .. } => centre + 1000.0 * distance * direction,
+    }
+}
+
+fn times(image: &Image, factor: Vec3) -> Image {
+    let mut out = image.clone();
+    let factors = factor.to_array();
+    out.data_mut().iter_mut().enumerate().for_each(|(i, v)| *v *= factors[i % 3]);
+    out
+}
+
+/// Reciprocals, 0 where there is no light.
+fn over(v: Vec3) -> Vec3 {
+    Vec3::from(v.to_array().map(|v| if v > 0.0 { 1.0 / v } else { 0.0 }))
+}
+
+impl RelighterSource {
+    /// What all lights of the capture's photographs are compared with: their mean irradiance, so that radiances are as bright as in the photographs.
+    fn unit(&self, capture: &Capture, centre: Vec3) -> f32 {
+        let lights = capture.train.iter().flat_map(|view| &view.shots).map(|shot| &shot.light);
+        let (sum, n) = lights.fold((0.0, 0usize), |(sum, n), light| {
+            (sum + irradiance(light, centre, self.falloff).element_sum() / 3.0, n + 1)
+        });
+        if n > 0 && sum > 0.0 { sum / n as f32 } else { 1.0 }
+    }
+
+    /// Targets of one photograph.
+    fn relit(
+        &mut self,
+        capture: &Capture,
+        (view, shot): (usize, usize),
+        lights: &[OlatLight],
+    ) -> Result<Vec<Picture>, SourceError> {
+        let (taken, camera) = (&capture.train[view].shots[shot], capture.train[view].camera);
+        let observation = capture.observation(taken)?;
+        let seen = SurfaceView::new(&self.surface, &camera, observation.mask.as_ref());
+        let ((depth, normals), coverage) = (seen.shape(), seen.coverage());
+        let centre = middle(&self.surface);
+        let distance = (camera.pose.centre() - centre).length();
+        let unit = self.unit(capture, centre);
+        let factor = |light: &OlatLight| irradiance(light, centre, self.falloff) / unit;
+        let from = factor(&taken.light);
+        let relight_view = RelightView {
+            camera,
+            source: times(&observation.radiance, over(from)),
+            coverage: coverage.clone(),
+            depth,
+            normals,
+            source_light: Some(place(&taken.light, centre, distance)),
+        };
+        let mut targets = Vec::with_capacity(lights.len());
+        for light in lights {
+            let prediction = match &mut self.medium {
+                Some(pictures) => Some(Prediction {
+                    source: times(&seen.predicted(pictures, &taken.light)?, over(from)),
+                    target: times(&seen.predicted(pictures, light)?, over(factor(light))),
+                }),
+                None => None,
+            };
+            targets.push(RelightTarget { light: place(light, centre, distance), prediction });
+        }
+        let made = self.relighter.relight(&relight_view, &targets, &self.options)?;
+        let pictures = made.into_iter().zip(lights).map(|(made, light)| {
+            Ok(Picture {
+                confidence: self.confidence(&made, &coverage),
+                radiance: times(&made.image, factor(light)),
+                mask: Some(Mask::from_channel(&coverage, 0)?),
+            })
+        });
+        pictures.collect()
+    }
+
+    /// [eq:relit-confidence] 1/(1 + (e² + d²)/h²): e the error on objects that were held out of training, d the deviation over runs, h the error that is
+    /// believed by half; all display values. Nothing is believed to be where nothing is.
+    fn confidence(&self, made: &Relit, coverage: &Image) -> Image {
+        let display = |v: f32| Transfer::Srgb.encode(v.clamp(0.0, 1.0));
+        let (width, height, _) = made.image.shape();
+        let mut out = Image::new(width, height, 1);
+        for (i, confidence) in out.data_mut().iter_mut().enumerate() {
+            let mean = made.image.data()[3 * i..][..3].iter().sum::<f32>() / 3.0;
+            let spread = display(mean + made.deviation.data()[i]) - display(mean);
+            let squares = (self.error * self.error + spread * spread) / (self.half_error * self.half_error);
+            *confidence = if coverage.data()[i] > 0.0 { 1.0 / (1.0 + squares) } else { 1.0 };
+        }
+        out
+    }
+}
+
+/// The mean of a surface's places.
+fn middle(surface: &Surface) -> Vec3 {
+    let places = surface.positions();
+    places.iter().sum::<Vec3>() / places.len().max(1) as f32
+}
+
+impl Source for RelighterSource {
+    fn method(&self) -> String {
+        let with = if self.medium.is_some() { "relighter on a medium" } else { "relighter" };
+        format!("diffusion: {with}")
+    }
+
+    fn state(&self) -> String {
+        self.state.clone()
+    }
+
+    fn pictures(&mut self, capture: &Capture, targets: &[Target]) -> Result<Vec<Picture>, SourceError> {
+        let mut out = Vec::with_capacity(targets.len());
+        // Lights of one photograph are made together, but each by itself would be the same: noise is shared.
+        for same in targets.chunk_by(|a, b| a.photograph == b.photograph && a.view == b.view) {
+            let lights: Vec<OlatLight> = same.iter().map(|target| target.light).collect();
+            match same[0].view {
+                Some(view) if same[0].photograph.0 == view => {
+                    out.extend(self.relit(capture, same[0].photograph, &lights)?)
+                }
+                // It turns lights, not views: nothing is believed, and the pictures are refused.
+                _ => out.extend(same.iter().map(|target| {
+                    let k = target.camera.intrinsics;
+                    let (width, height) = (k.width as usize, k.height as usize);
+                    Picture {
+                        radiance: Image::new(width, height, 3),
+                        mask: None,
+                        confidence: Image::new(width, height, 1),
+                    }
+                })),
+            }
+        }
+        Ok(out)
+    }
+}
