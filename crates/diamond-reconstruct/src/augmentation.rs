@@ -20,7 +20,7 @@ const MADE_BY: &str = "made_pictures";
 pub(crate) struct MadePictures {
     /// Sources beside the prior, in the order in which they are asked.
     pub sources: Vec<Box<dyn Source>>,
-    /// Makes the source that corrects the prior, or works on its surface.
+    /// Makes the source that works on the prior's surface.
     pub relighter: Option<Box<dyn GuidedSource>>,
     /// Where pictures are kept.
     pub folder: Option<PathBuf>,
@@ -122,10 +122,9 @@ impl MadePictures {
                         .into(),
             })?;
             if let Some(prior) = prior {
-                let both = settings.source == AugmentationSource::Both;
                 let guidance = Guidance {
                     surface: prior.surface(),
-                    medium: both.then(|| prior.medium()),
+                    medium: prior.medium(),
                     falloff: model.scene.falloff(&model.config),
                     half_error: settings.half_error,
                     state: &prior.state(),
@@ -160,8 +159,10 @@ impl MadePictures {
         if let PriorState::Open = self.prior {
             let fitted = match &model.medium {
                 Some(term) => Ok((term.surface().clone(), term.medium().clone())),
-                None if model.config.augmentation.source == AugmentationSource::Prior
-                    || model.config.augmentation.asks_relighter() =>
+                None if !matches!(
+                    model.config.augmentation.source,
+                    AugmentationSource::Auto | AugmentationSource::None
+                ) =>
                 {
                     surface_and_medium(model, capture)
                 }

@@ -3,6 +3,7 @@ use crate::{ReconstructError, SubsurfaceModel};
 use diamond_augment::{GenerateOptions, Wanted};
 use diamond_medium::PriorOptions;
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 
 /// Who makes pictures that nobody took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -15,9 +16,10 @@ pub enum AugmentationSource {
     None,
     /// The physical prior: a medium fitted to the photographs, in the surface of the model as it stands. With a medium in the model it is that one.
     Prior,
-    /// A relighter that diffuses what shading leaves out, from each view's own photographs and the surface's shape.
+    /// The relighter of the file [`AugmentationSettings::relighter`]: it diffuses what is wrong with a prediction, from each view's own photographs. The
+    /// prediction is the physical prior's where the network was trained with such, and shading's otherwise.
     Diffusion,
-    /// A relighter that corrects the pictures of the physical prior.
+    /// The physical prior and the relighter, each.
     Both,
 }
 
@@ -27,6 +29,9 @@ pub enum AugmentationSource {
 pub struct AugmentationSettings {
     /// Who makes them.
     pub source: AugmentationSource,
+    /// File of the relighter's weights, which `diamond train` has written.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub relighter: Option<PathBuf>,
     /// Fraction of the run at which they are made, and from which on they are learned from…
     pub from: f32,
     /// …and until which.
@@ -55,6 +60,7 @@ impl Default for AugmentationSettings {
         let (prior, judge) = (PriorOptions::default(), GenerateOptions::default());
         Self {
             source: AugmentationSource::Auto,
+            relighter: None,
             from: 0.0,
             until: 1.0,
             share: 0.5,
@@ -74,8 +80,8 @@ impl AugmentationSettings {
     pub(crate) fn asks_prior(&self, model: SubsurfaceModel) -> bool {
         match self.source {
             AugmentationSource::Auto => model.has_medium(),
-            AugmentationSource::Prior => true,
-            AugmentationSource::None | AugmentationSource::Diffusion | AugmentationSource::Both => false,
+            AugmentationSource::Prior | AugmentationSource::Both => true,
+            AugmentationSource::None | AugmentationSource::Diffusion => false,
         }
     }
 

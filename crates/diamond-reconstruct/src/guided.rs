@@ -8,8 +8,8 @@ use diamond_medium::{Medium, Surface};
 pub struct Guidance<'a> {
     /// The object's surface.
     pub surface: &'a Surface,
-    /// The medium that was fitted in it, where the source may use it.
-    pub medium: Option<&'a Medium>,
+    /// The medium that was fitted in it.
+    pub medium: &'a Medium,
     /// Falloff of lights.
     pub falloff: Falloff,
     /// Error, in display values, at which a pixel is believed by half.

@@ -63,7 +63,7 @@ pub use plan::{Milestone, Plan, PlanOptions, plan_capture};
 pub use predicted_shards::export_predictions;
 pub use reconstruct_run::{Event, Outcome, ReconstructOptions, reconstruct};
 pub use relight::render_lights;
-pub use relighter_source::{RelighterSource, ShippedRelighter, SurfaceView};
+pub use relighter_source::{RelighterOnSurface, RelighterSource, SurfaceView};
 pub use render_run::{RenderOptions, render_folder};
 pub use report::write_report;
 pub use run_record::{RunRecord, StoredCamera, StoredLight};

@@ -1,5 +1,5 @@
 //! A whole run: from a capture to model, figures and report, with checkpoints on the way.
-use crate::ShippedRelighter;
+use crate::RelighterOnSurface;
 use crate::capture_check::{check_images, open_capture};
 use crate::evaluation::evaluate_with;
 use crate::output_file::write_json;
@@ -189,6 +189,20 @@ const RESULTS: [&str; 19] = [
     MADE_PICTURES,
 ];
 
+/// The relighter of a configuration, if it asks for one.
+fn relighter_of(config: &Config) -> Result<Option<RelighterOnSurface>, SssError> {
+    if !config.augmentation.asks_relighter() {
+        return Ok(None);
+    }
+    match &config.augmentation.relighter {
+        Some(path) => RelighterOnSurface::load(path).map(Some),
+        None => Err(SssError::Usage(
+            "augmentation.source asks for a relighter: name the file of one that `diamond train` has written as augmentation.relighter"
+                .into(),
+        )),
+    }
+}
+
 fn clear(folder: &Path) -> Result<(), SssError> {
     for name in RESULTS {
         let path = folder.join(name);
@@ -292,6 +306,7 @@ fn run(
     if options.force {
         clear(folder)?;
     }
+    let relighter = relighter_of(&config)?;
     let resumed = options.resume && Reconstruction::has_checkpoint(&checkpoint);
     let mut costs = Costs::default();
     let mut training = if resumed {
@@ -303,8 +318,8 @@ fn run(
         }
         Reconstruction::new(capture.clone(), &config)?
     };
-    if config.augmentation.asks_relighter() {
-        training = training.with_relighter(Box::new(ShippedRelighter::default()));
+    if let Some(relighter) = relighter {
+        training = training.with_relighter(Box::new(relighter));
     }
     training.keep_pictures_in(&folder.join(MADE_PICTURES));
     if let Some(device) = device {

@@ -1,16 +1,17 @@
 //! The relighter as a source of pictures that nobody took, and what a fitted medium says to it.
+use crate::SssError;
 use diamond_augment::{Picture, Source, SourceError, Target};
 use diamond_camera::Camera;
 use diamond_dataset::Capture;
+use diamond_diffusion::DiffusionError;
 use diamond_diffusion::relight::{Prediction, RelightOptions, RelightTarget, RelightView, Relighter, Relit};
 use diamond_image::{Image, Mask, Transfer};
 use diamond_light::{Falloff, OlatLight};
 use diamond_medium::{MediumPictures, Sight, Surface};
 use diamond_reconstruct::{Guidance, GuidedSource};
 use glam::Vec3;
-
-/// The model that the program contains; `assets/models/README.md` says how it was trained.
-const SHIPPED: &[u8] = include_bytes!("../../../assets/models/relighter.safetensors");
+use std::path::Path;
+use std::sync::Arc;
 
 /// Error that is assumed of a relighter whose file does not state it: about that of shading, display values.
 const ASSUMED_ERROR: f32 = 0.08;
@@ -48,7 +49,7 @@ impl SurfaceView {
 
 /// Relights photographs of a capture.
 pub struct RelighterSource {
-    relighter: Relighter,
+    relighter: Arc<Relighter>,
     options: RelightOptions,
     surface: Surface,
     medium: Option<MediumPictures>,
@@ -58,26 +59,38 @@ pub struct RelighterSource {
     state: String,
 }
 
-/// Makes a [`RelighterSource`] of the relighter that the program contains, or of a file's.
-#[derive(Debug, Clone, Default)]
-pub struct ShippedRelighter {
-    /// Another model than the program's own.
-    pub file: Option<std::path::PathBuf>,
+/// Makes a [`RelighterSource`] of a network when pictures are due.
+#[derive(Debug, Clone)]
+pub struct RelighterOnSurface {
+    relighter: Arc<Relighter>,
 }
 
-impl GuidedSource for ShippedRelighter {
+impl RelighterOnSurface {
+    /// Of a file that `diamond train` has written.
+    ///
+    /// # Errors
+    /// A file that cannot be read, of another model, or damaged.
+    pub fn load(path: &Path) -> Result<Self, SssError> {
+        let relighter = Relighter::load(path).map_err(|e| match e {
+            DiffusionError::File { path, problem } | DiffusionError::Weights { origin: path, problem } => {
+                SssError::Input { path: path.into(), detail: problem }
+            }
+            other => SssError::Input { path: path.to_owned(), detail: other.to_string() },
+        })?;
+        Ok(Self { relighter: Arc::new(relighter) })
+    }
+}
+
+impl GuidedSource for RelighterOnSurface {
     fn source(&self, guidance: Guidance<'_>) -> Result<Box<dyn Source>, SourceError> {
-        let relighter = match &self.file {
-            Some(path) => Relighter::load(path)?,
-            None => Relighter::from_bytes(SHIPPED, "the relighter in the program")?,
-        };
-        let medium = match guidance.medium {
-            Some(medium) => Some(MediumPictures::new(guidance.surface.clone(), medium.clone(), guidance.falloff)?),
-            None => None,
-        };
+        let relighter = Arc::clone(&self.relighter);
+        // Who was never told what a medium predicts would not know what to do with it.
+        let with_medium = relighter.expected_error(true).is_some();
+        let pictures = || MediumPictures::new(guidance.surface.clone(), guidance.medium.clone(), guidance.falloff);
+        let medium = with_medium.then(pictures).transpose()?;
         let options = RelightOptions::default();
-        let error = relighter.expected_error(medium.is_some()).unwrap_or(ASSUMED_ERROR);
-        let state = format!("{} {options:?} {} {}", relighter.digest(), guidance.state, medium.is_some());
+        let error = relighter.expected_error(with_medium).unwrap_or(ASSUMED_ERROR);
+        let state = format!("{:016x} {options:?} {with_medium} {}", relighter.digest(), guidance.state);
         Ok(Box::new(RelighterSource {
             relighter,
             options,

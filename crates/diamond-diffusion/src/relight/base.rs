@@ -165,7 +165,7 @@ fn solve(matrix: &[[f64; BASES]; BASES], right: &[f64; BASES], among: &[usize]) 
     for k in 0..n {
         let (done, rest) = rows.split_at_mut(k + 1);
         let pivot = &done[k];
-        if !(pivot[k] > 0.0) {
+        if pivot[k] <= 0.0 || pivot[k].is_nan() {
             return None;
         }
         for row in rest {

@@ -306,7 +306,7 @@ fn read_shard(path: &Path, size: usize) -> Result<Vec<Stored>> {
             let at = v * lights + l;
             let position = Vec3::from_slice(&positions[at * 3..][..3]);
             let intensity = Vec3::from_slice(&intensities[at * 3..][..3]);
-            if !(intensity.min_element() > 0.0) {
+            if intensity.min_element() <= 0.0 || intensity.is_nan() {
                 continue;
             }
             let normalized = |image: Image| {

@@ -80,7 +80,7 @@ fn hints_have_the_values_by_hand() {
         assert!((at(c) - (-half.z).powi(32)).abs() < 1e-3);
     }
     // White as predicted, and what the source is over its own prediction.
-    assert_eq!([at(15), at(16), at(17), at(21)], [1.0; 4]);
+    assert!([at(15), at(16), at(17), at(21)].iter().all(|v| (v - 1.0).abs() < 1e-5));
     let red = view.source.pixel(16, 16)[0];
     assert!((at(18) - 2.0 * ((red + 0.02) / 0.12).ln()).abs() < 1e-5);
     // A corner sees nothing: black, no coverage, no shape.
