@@ -241,3 +241,74 @@ impl Source for RelighterSource {
         Ok(out)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamond_augment::{Lack, Wanted};
+    use diamond_dataset::{OpenOptions, Regime};
+    use diamond_diffusion::nn::{Source as Weights, VariablesBuilder};
+    use diamond_diffusion::relight::RelighterConfig;
+    use diamond_pathtrace::Mesh;
+
+    const FALLOFF: Falloff = Falloff::InverseSquare { reference: 1.0 };
+
+    fn capture() -> Capture {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/captures/candle-small");
+        let whole = Capture::open(folder.as_ref(), &OpenOptions::default()).unwrap();
+        "full-one".parse::<Regime>().and_then(|r| r.apply(&whole, 0)).unwrap()
+    }
+
+    /// An untrained network on a ball.
+    fn source() -> RelighterSource {
+        let builder = VariablesBuilder::new(Weights::Seed(3));
+        let config = RelighterConfig { size: 16, ..RelighterConfig::shipped() };
+        RelighterSource {
+            relighter: Arc::new(Relighter::new(&builder.root(), &config).unwrap()),
+            options: RelightOptions { steps: 2, ..RelightOptions::default() },
+            surface: Surface::new(Mesh::icosphere(Vec3::ZERO, 0.7, 3), 200).unwrap(),
+            medium: None,
+            falloff: FALLOFF,
+            half_error: 0.05,
+            error: 0.05,
+            state: "untrained".into(),
+        }
+    }
+
+    /// [eq:relit-confidence] Pictures come in the order of the targets and do not depend on what else is asked for; a light of twice the intensity is twice as
+    /// bright; where the photographs show nothing there is nothing, for sure, and elsewhere no more than half is believed where the error is the half error.
+    #[test]
+    fn relit_pictures_are_lights_in_order_and_what_is_not_there_is_sure() {
+        let (capture, mut source) = (capture(), source());
+        let lack = Lack::of(&capture, &Wanted { lights: 2, ..Wanted::default() });
+        let mut targets = lack.targets[..3].to_vec();
+        targets.push(Target { light: targets[0].light.scaled(Vec3::splat(2.0)), ..targets[0] });
+        let all = source.pictures(&capture, &targets).unwrap();
+        assert_eq!(all.len(), 4);
+        for (target, picture) in targets.iter().zip(&all) {
+            let alone = source.pictures(&capture, std::slice::from_ref(target)).unwrap().remove(0);
+            assert!(alone == *picture, "it depends on what else is asked for");
+            let mask = picture.mask.as_ref().unwrap();
+            for (confidence, covered) in picture.confidence.data().iter().zip(mask.data()) {
+                assert!(if *covered > 0.0 { *confidence <= 0.5 && *confidence > 0.0 } else { *confidence == 1.0 });
+            }
+        }
+        assert!(all[0].radiance.data().iter().any(|v| *v > 0.01) && all[0].radiance != all[1].radiance);
+        for (one, two) in all[0].radiance.data().iter().zip(all[3].radiance.data()) {
+            assert!((2.0 * one - two).abs() <= 1e-5 * two.abs() + 1e-7, "{one} {two}");
+        }
+        let elsewhere = Target { view: None, ..targets[0] };
+        let unknown = source.pictures(&capture, &[elsewhere]).unwrap().remove(0);
+        assert!(unknown.confidence.data().iter().all(|c| *c == 0.0));
+    }
+
+    #[test]
+    fn files_that_hold_no_relighter_are_refused() {
+        let path = std::env::temp_dir().join(format!("diamond-no-relighter-{}.safetensors", std::process::id()));
+        let refused = || RelighterOnSurface::load(&path).unwrap_err().to_string();
+        assert!(refused().contains("cannot be read"), "{}", refused());
+        std::fs::write(&path, b"no weights").unwrap();
+        assert!(refused().contains("no-relighter"), "{}", refused());
+        std::fs::remove_file(&path).unwrap();
+    }
+}

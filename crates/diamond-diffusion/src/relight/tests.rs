@@ -133,7 +133,7 @@ fn bad_views_are_refused() {
     RelighterConfig::shipped().validate().unwrap();
 }
 
-/// Shading finds the ball's factors: 0.8, 0.6 and 0.3 times n·l, and 0.05 from everywhere in red and green. Relit, it is the ball under the other light.
+/// [eq:shading-bases] Shading finds the ball's factors: 0.8, 0.6 and 0.3 times n·l, and 0.05 from everywhere in red and green. Relit, it is the ball under the other light.
 #[test]
 fn shading_of_a_ball_is_the_ball() {
     let (left, right) = (ball(24, LEFT), ball(24, RIGHT));
