@@ -174,7 +174,11 @@ impl RelighterSource {
             };
             targets.push(RelightTarget { light: place(light, centre, distance), prediction });
         }
-        let made = self.relighter.relight(&relight_view, &targets, &self.options)?;
+        // Each by itself: matrix products of several lights at once have other last bits, and a picture must not depend on what else is asked for.
+        let mut made = Vec::with_capacity(targets.len());
+        for target in &targets {
+            made.extend(self.relighter.relight(&relight_view, std::slice::from_ref(target), &self.options)?);
+        }
         let pictures = made.into_iter().zip(lights).map(|(made, light)| {
             Ok(Picture {
                 confidence: self.confidence(&made, &coverage),
@@ -219,7 +223,7 @@ impl Source for RelighterSource {
 
     fn pictures(&mut self, capture: &Capture, targets: &[Target]) -> Result<Vec<Picture>, SourceError> {
         let mut out = Vec::with_capacity(targets.len());
-        // Lights of one photograph are made together, but each by itself would be the same: noise is shared.
+        // Lights of one photograph share its geometry.
         for same in targets.chunk_by(|a, b| a.photograph == b.photograph && a.view == b.view) {
             let lights: Vec<OlatLight> = same.iter().map(|target| target.light).collect();
             match same[0].view {
