@@ -11,10 +11,10 @@ use std::time::Instant;
 /// When cargo cannot be started or the tree cannot be read.
 pub fn run(root: &Path, full: bool) -> Result<bool, String> {
     let start = Instant::now();
-    let mut passed = timed("cargo test --workspace", || cargo(root, &["test", "--workspace"]))?;
+    let mut passed = timed("cargo test --workspace", || cargo(root, &["test", "--workspace", "--no-fail-fast"]))?;
     if full {
         // Not --include-ignored on the first run: it would compile documentation examples that are marked `ignore`.
-        let arguments = ["test", "--workspace", "--lib", "--bins", "--tests", "--", "--ignored"];
+        let arguments = ["test", "--workspace", "--no-fail-fast", "--lib", "--bins", "--tests", "--", "--ignored"];
         passed &= timed("long tests", || cargo(root, &arguments))?;
     }
     passed &= timed("tidy", || {
